@@ -17,6 +17,7 @@ use super::error::ShmError;
 use super::lock::FileLock;
 use super::root::{InstanceDir, SHM_DIR};
 use super::segment::Segment;
+use super::send_log::SendLog;
 use super::wake::{LaneSleeper, LaneWaker};
 use crate::config::Settings;
 use crate::model::{
@@ -77,7 +78,7 @@ pub enum Stage {
 }
 
 /// Incremented whenever the meaning of a word in the segment changes.
-const LAYOUT_VERSION: u32 = 11;
+const LAYOUT_VERSION: u32 = 12;
 /// "ABboards": the first word, by which a file of another program is rejected.
 const MAGIC: u64 = 0x4142_626f_6172_6473;
 const HISTOGRAM_WORDS: usize = size_of::<LatencyHistogram>() / 8;
@@ -104,7 +105,7 @@ struct Layout {
     output_readers: usize,
     lane_identity: usize,
     writer_identity: usize,
-    sent_number: usize,
+    send_log: usize,
     histograms: usize,
     words: usize,
 }
@@ -138,7 +139,7 @@ impl Layout {
             output_readers: next(lanes * routes * Cell::<OutputReaders>::WORDS),
             lane_identity: next(lanes * Cell::<LaneIdentity>::WORDS),
             writer_identity: next(lanes * routes * Cell::<WriterIdentity>::WORDS),
-            sent_number: next(lanes * routes * LINE),
+            send_log: next(lanes * routes * SendLog::WORDS),
             histograms: next(routes * (1 + 3 * lanes) * HISTOGRAM_WORDS.next_multiple_of(LINE)),
             words: end,
         }
@@ -332,10 +333,12 @@ impl Boards {
         Ok(Policies { boards: self, _lock: lock })
     }
 
-    /// The highest sequence number of the DDS writer of a lane's output of a route. One process at a time.
-    pub fn sent_number(&self, lane: usize, route: usize) -> SentNumber {
-        let at = self.layout.sent_number + self.layout.output(lane, route) * LINE;
-        SentNumber { segment: self.segment.clone(), at }
+    /// The send log of a lane's output of a route. One process at a time.
+    pub fn send_log(&self, lane: usize, route: usize) -> SendLog {
+        SendLog::at(
+            self.segment.clone(),
+            self.layout.send_log + self.layout.output(lane, route) * SendLog::WORDS,
+        )
     }
 
     /// The waker of a lane, for ingress.
@@ -427,25 +430,6 @@ pub fn write_rows<T: Plain + PartialEq>(writers: &mut [BoardWriter<T>], rows: im
     writers.iter_mut().zip(rows).for_each(|(writer, row)| writer.set(row));
 }
 
-/// The highest sequence number of a DDS writer. A store is that of one word, before the number is sent.
-#[derive(Clone, Debug)]
-pub struct SentNumber {
-    segment: Arc<Segment>,
-    at: usize,
-}
-
-impl SentNumber {
-    /// The number.
-    pub fn get(&self) -> i64 {
-        self.segment.word(self.at).load(Ordering::Acquire).cast_signed()
-    }
-
-    /// Sets the number.
-    pub fn set(&self, number: i64) {
-        self.segment.word(self.at).store(number.cast_unsigned(), Ordering::Release);
-    }
-}
-
 /// The only writer of a histogram.
 #[derive(Debug)]
 pub struct HistogramWriter {
@@ -502,7 +486,7 @@ mod tests {
                 found.push(place(layout.lane(lane, route)));
                 found.push(place(layout.output_readers(lane, route)));
                 found.push(place(layout.writer_identity(lane, route)));
-                found.push((layout.sent_number + layout.output(lane, route) * LINE, LINE));
+                found.push((layout.send_log + layout.output(lane, route) * SendLog::WORDS, SendLog::WORDS));
                 stages.extend([Stage::Shm(lane), Stage::DdsOut(lane), Stage::Age(lane)]);
             }
             let words = size_of::<LatencyHistogram>().div_ceil(8).next_multiple_of(LINE);

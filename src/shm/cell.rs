@@ -64,7 +64,7 @@ plain! {
     PatternRecord: 4 + 16,
     PartialSample: 11 + 16,
     IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 5 + 3 + 2,
-    LaneCounters: 6 + DropReason::COUNT + 7,
+    LaneCounters: 6 + DropReason::COUNT + 8,
     OutputReaders: MAX_OUTPUT_READERS * (6 + 2) + MAX_UNMATCHED_READERS * 3 + 2,
     LaneIdentity: 8,
     WriterIdentity: 3,

@@ -29,12 +29,13 @@ mod publisher;
 mod roles;
 mod root;
 mod segment;
+mod send_log;
 mod service;
 mod subscriber;
 mod wake;
 
 pub use board::{
-    BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, SentNumber, Stage, write_rows,
+    BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, Stage, write_rows,
 };
 pub use budget::{DEFAULT_BUDGET_BYTES, NoMemory, PoolBudget, PoolUse, budget_bytes};
 pub use channel::{OTHER_SHARED_BYTES, PoolSize, QueueLimits, RouteChannel};
@@ -47,5 +48,6 @@ pub use pool_view::{PoolPayload, PoolView};
 pub use publisher::{LentSlot, LoanError, PublishError, SamplePublisher, Slot};
 pub use roles::{RoleHolder, RoleLock, instance_files};
 pub use root::{default_root, root_of};
+pub use send_log::SendLog;
 pub use subscriber::{SampleSubscriber, ShmSample, SubscriberRole, TakeError};
 pub use wake::{LaneSleeper, LaneWaker, Woken, this_cpu};

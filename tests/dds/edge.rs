@@ -405,8 +405,7 @@ fn a_writer_takes_every_sample_and_the_reader_that_lags_misses_the_oldest() {
         for _ in 0..200 {
             let mut payload = vec![0; 1 << 20];
             payload[..2].copy_from_slice(&written.to_be_bytes());
-            let sample =
-                writer.write(payload.into(), Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
+            let sample = writer.write(payload.into(), Encapsulation::CDR_LE, SourceTimestamp::NONE).unwrap();
             assert_eq!(sample.readers, 1);
             written += 1;
         }

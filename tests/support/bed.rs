@@ -38,35 +38,21 @@ impl Bed {
 
     /// Like [`start`](Self::start), but `up` leaves children alone that the test stops.
     pub fn start_without_watchdog(test: &str, yaml: &str) -> Option<Self> {
-        Self::start_up(test, yaml, &[], "up --no-watchdog", None)
+        Self::start_up(test, yaml, &[], "up --no-watchdog")
     }
 
     /// Like [`start`](Self::start), with more hosts than the default four.
     pub fn start_with(test: &str, yaml: &str, more: &[&str]) -> Option<Self> {
-        Self::start_up(test, yaml, more, "up", None)
+        Self::start_up(test, yaml, more, "up")
     }
 
-    /// Like [`start`](Self::start), with a variable in the environment of the bridge.
-    pub fn start_in(test: &str, yaml: &str, variable: (&'static str, &'static str)) -> Option<Self> {
-        Self::start_up(test, yaml, &[], "up", Some(variable))
-    }
-
-    fn start_up(
-        test: &str,
-        yaml: &str,
-        more: &[&str],
-        up: &str,
-        variable: Option<(&'static str, &'static str)>,
-    ) -> Option<Self> {
+    fn start_up(test: &str, yaml: &str, more: &[&str], up: &str) -> Option<Self> {
         if let Some(reason) = super::testbed_missing() {
             super::skip(test, &reason);
             return None;
         }
         let net = Net::new(&[&["publisher", "bridge", "critical", "slow"], more].concat());
-        let mut bridge = Bridge::new(&format!("instance: {{instance}}\n{yaml}"));
-        if let Some((name, value)) = variable {
-            bridge.set_environment(name, value);
-        }
+        let bridge = Bridge::new(&format!("instance: {{instance}}\n{yaml}"));
         let up = bridge.start_on(net.host("bridge"), up);
         let bed = Self { up, bridge, net };
         bed.wait_up();

@@ -41,6 +41,11 @@ impl FormerReaders {
         Self { missing, more, wait_ends_at: now.plus_ms(WAIT_MS), hold_ends_at: now.plus_ms(HOLD_MS) }
     }
 
+    /// The readers that are missing, as far as they are known.
+    pub fn missing(&self) -> &[Guid] {
+        &self.missing
+    }
+
     /// Whether none is missing any more.
     pub const fn is_empty(&self) -> bool {
         self.missing.is_empty() && !self.more

@@ -6,6 +6,8 @@
 //! without an identity.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use tracing::{info, warn};
 
@@ -17,16 +19,17 @@ use crate::model::{
     DdsType, Durability, Guid, LaneIdentity, MonotonicNs, ProcessHealth, QosProfile, TrafficClass,
     WriterIdentity,
 };
-use crate::shm::{BoardWriter, Journal, SentNumber};
-
-/// Switches it on, for tests and measurements, until no sample is lost with it.
-const SWITCH: &str = "ADAPTIVE_BRIDGE_KEEP_IDENTITY";
+use crate::shm::{BoardWriter, Journal, SendLog};
 
 /// The longest time without a process, below the lease of 15 s: then others drop the participant.
 const MAX_AWAY_MS: u64 = 10_000;
 
 /// How long a process that has taken an identity over runs before the next one may.
 const PROVEN_AFTER_MS: u64 = 1_000;
+
+/// The share of the lane's time that the journal takes at most: it is written on the lane's thread, and a
+/// thousand participants that come and go change it with each housekeeping.
+const JOURNAL_SHARE: u64 = 20;
 
 /// What a process may use between two updates of the board, each 100 ms.
 const RESERVED_COUNTS: i32 = 1 << 16;
@@ -40,6 +43,9 @@ pub(super) struct Identity {
     /// Whether the next process may continue this one.
     is_kept: bool,
     proven_at: MonotonicNs,
+    /// Whether discovery has changed since the journal was written.
+    is_outdated: bool,
+    journal_at: MonotonicNs,
 }
 
 impl Identity {
@@ -52,7 +58,7 @@ impl Identity {
         options: &ParticipantOptions,
     ) -> Result<(Participant, Option<Self>), RoleError> {
         let lane = &settings.lanes[index];
-        if lane.class() != TrafficClass::Critical || std::env::var_os(SWITCH).is_none() {
+        if lane.class() != TrafficClass::Critical {
             return Ok((role.join(options)?, None));
         }
         let mut identity = Self {
@@ -61,6 +67,8 @@ impl Identity {
             conditions: conditions(options)?,
             is_kept: true,
             proven_at: clock::monotonic().plus_ms(PROVEN_AFTER_MS),
+            is_outdated: false,
+            journal_at: MonotonicNs(0),
         };
         let former = if may_be_kept(role, lane) { identity.former(role) } else { None };
         identity.journal.remove();
@@ -154,12 +162,15 @@ impl Identity {
         self.is_kept &= may_be_kept;
         let unproven = self.board.get().unproven != 0 && now < self.proven_at;
         self.record(participant, unproven);
-        if !self.is_kept || !discovery_changed {
+        self.is_outdated |= discovery_changed;
+        if !self.is_kept || !self.is_outdated || now < self.journal_at {
             return;
         }
+        self.is_outdated = false;
         if let Err(error) = self.journal.write(participant.guid(), &participant.discovery_journal()) {
             warn!(%error, "cannot write the journal of discovery; after a kill, subscribers match anew");
         }
+        self.journal_at = now.plus_ns(clock::monotonic().since(now) * JOURNAL_SHARE);
     }
 
     /// The next process does not continue this one: it says goodbye, or announces what the next one cannot.
@@ -209,8 +220,10 @@ fn conditions(options: &ParticipantOptions) -> Result<u64, RoleError> {
 /// The identity of the DDS writer of one output.
 pub(super) struct WriterRecord {
     board: BoardWriter<WriterIdentity>,
-    number: SentNumber,
+    log: SendLog,
     route: usize,
+    /// The sequence number in the route of the sample that is being written.
+    writing: Arc<AtomicU64>,
     /// Whether this process has had a writer, which has said goodbye when it has another one.
     had_writer: bool,
 }
@@ -221,14 +234,34 @@ impl WriterRecord {
         let kept = role.boards.lane_identity(lane)?;
         (kept.is_intact() && kept.participant == participant.guid()).then(|| Self {
             board: role.boards.writer_identity_writer(lane, route),
-            number: role.boards.sent_number(lane, route),
+            log: role.boards.send_log(lane, route),
             route,
+            writing: Arc::default(),
             had_writer: false,
         })
     }
 
-    /// How the next writer begins: where that of the former process ended, if it is the first one, of the
-    /// same participant, and offers the same.
+    /// The RTPS sequence numbers of the last samples that the former process has written, each with the
+    /// sequence number in the route. [`next`](Self::next) may find that its writer can't be continued.
+    pub fn logged(&self) -> Vec<(i64, u64)> {
+        if self.is_continuable() { self.log.samples() } else { Vec::new() }
+    }
+
+    /// To be called before the sample with this sequence number in the route is written.
+    pub fn writing(&self, sequence: u64) {
+        self.writing.store(sequence, Ordering::Relaxed);
+    }
+
+    fn is_continuable(&self) -> bool {
+        let former = self.board.get();
+        !self.had_writer
+            && former.is_intact()
+            && former.count > 0
+            && (0..i64::MAX / 2).contains(&self.log.highest())
+    }
+
+    /// How the next writer begins: where that of the former process ended, with its last samples, if it is
+    /// the first one, of the same participant, and offers the same; else without them.
     pub fn next(
         &mut self,
         participant: Guid,
@@ -240,23 +273,26 @@ impl WriterRecord {
         (participant, topic, dds_type.name, dds_type.has_keys, qos).hash(&mut hasher);
         let offer = hasher.finish();
         let former = *self.board.get();
-        let is_former = !std::mem::replace(&mut self.had_writer, true)
-            && former.is_intact()
-            && former.offer == offer
-            && former.count > 0
-            && (0..i64::MAX / 2).contains(&self.number.get());
+        let is_former = self.is_continuable() && former.offer == offer;
+        self.had_writer = true;
         if !is_former {
             // In this order: no number goes with the wrong writer if the process dies in between.
             self.board.set(WriterIdentity::default());
-            self.number.set(0);
+            self.log.reset();
             let count = former.count.wrapping_add(1).max(1);
             self.board.set(WriterIdentity { count, offer, ..WriterIdentity::default() }.sealed());
         }
-        let number = self.number.clone();
+        let (log, writing) = (self.log.clone(), self.writing.clone());
         WriterContinuation {
             key: key(self.route, self.board.get().count),
-            highest_number: self.number.get(),
-            on_number: Box::new(move |sent| number.set(sent)),
+            highest_number: self.log.highest(),
+            samples: Vec::new(),
+            sent_through: self.log.highest(),
+            readers: Vec::new(),
+            on_number: Box::new(move |number, is_written| {
+                let sequence = if is_written { writing.load(Ordering::Relaxed) } else { 0 };
+                log.record(number, sequence);
+            }),
         }
     }
 

@@ -9,6 +9,7 @@ mod arena;
 mod bound_topic;
 mod early_send;
 mod former_readers;
+mod former_samples;
 mod gaps;
 mod history;
 mod identity;
@@ -56,7 +57,8 @@ const LAST_ACKNOWLEDGEMENTS_MS: u64 = 300;
 /// thread takes some 100 µs for a small sample in fragments.
 const UNSENT_POLL_NS: u64 = 250_000;
 
-/// How often a lane checks whether the readers have matched that its samples wait for after a restart.
+/// How often a lane checks whether the readers have matched that its samples wait for after a restart, and
+/// whether ingress has delivered the samples of the former process.
 const HOLD_POLL_MS: u64 = 5;
 
 /// What the lane does after a turn.
@@ -207,6 +209,9 @@ impl Egress {
                 output.read_progress();
             }
         }
+        for output in &mut self.outputs {
+            output.collect_former(&mut self.participant, &mut self.arena);
+        }
         let mut turn = Turn::UntilWoken(MonotonicNs(u64::MAX));
         for place in 0..self.outputs.len() {
             // The samples of higher priorities that may still go first; the count of wakes at the last check.
@@ -248,7 +253,7 @@ impl Egress {
         if self.count_sent() {
             until = MonotonicNs(until.0.min(now.plus_ns(UNSENT_POLL_NS).0));
         }
-        if self.outputs.iter().any(Output::is_held) {
+        if self.outputs.iter().any(|output| output.is_held() || output.collects_former()) {
             until = MonotonicNs(until.0.min(now.plus_ms(HOLD_POLL_MS).0));
         }
         let wait_ns = until.since(now);
@@ -363,7 +368,7 @@ impl Egress {
             std::thread::sleep(Duration::from_nanos(UNSENT_POLL_NS));
         }
         for output in &mut self.outputs {
-            output.drop_unsent();
+            output.shut_down();
             // The next process counts as unconfirmed what is not acknowledged now.
             output.record_readers(clock::monotonic());
         }

@@ -2,6 +2,7 @@
 
 mod announce;
 mod catch_up;
+mod former;
 mod matching;
 
 use bytes::Bytes;
@@ -13,6 +14,7 @@ use super::arena::CopyArena;
 use super::bound_topic::BoundTopic;
 use super::early_send::{EarlySend, Followed};
 use super::former_readers::FormerReaders;
+use super::former_samples::FormerSamples;
 use super::gaps::overwrite_reason;
 use super::history::{History, present_publishers};
 use super::identity::WriterRecord;
@@ -74,6 +76,10 @@ pub(super) struct Output {
     former_readers: FormerReaders,
     /// `None` if the lane does not keep its identity.
     record: Option<WriterRecord>,
+    /// While samples of the former process are collected.
+    former: Option<FormerSamples>,
+    /// A sample that was taken and is the next one.
+    next: Option<ShmSample>,
     /// Whether samples wait in the queue until the former readers have matched.
     is_held: bool,
     /// The publisher of the last sample taken.
@@ -104,27 +110,21 @@ impl Output {
         let lane = &settings.lanes[lane_index];
         let route = &settings.routes[output.route];
         let boards = role.boards.clone();
-        let mut counters = boards.lane_writer(lane_index, output.route);
-        let mut readers = boards.output_readers_writer(lane_index, output.route);
-        // Before `readers` loses the records: if this process dies in between, they are counted twice.
-        counters.update(|counters| {
-            // The samples that waited in a killed former process are lost with it.
-            let accounted = counters.forwarded + counters.drops.total();
-            counters.drops.add(DropReason::LaneDown, counters.received().saturating_sub(accounted));
-            counters.unconfirmed = counters.unconfirmed.saturating_add(readers.get().unconfirmed(counters));
-            counters.waiting = 0;
-            counters.readers = 0;
-        });
-        let former = *counters.get();
-        let former_readers = FormerReaders::of(readers.get(), clock::monotonic());
-        readers.set(former_readers.on_board(former.forwarded));
+        let counters = boards.lane_writer(lane_index, output.route);
+        let readers = boards.output_readers_writer(lane_index, output.route);
+        let record = WriterRecord::of(role, participant, lane_index, output.route);
+        let logged = record.as_ref().map(WriterRecord::logged).unwrap_or_default();
+        let started_at = clock::monotonic();
+        let former_readers = FormerReaders::of(readers.get(), started_at);
+        let unconfirmed = readers.get().unconfirmed(counters.get());
+        let offer = Offer::of(lane, output.qos);
+        let former_samples = FormerSamples::new(logged, offer.window_samples, unconfirmed, started_at);
         let subscriber = SampleSubscriber::open(
             &role.node,
             &RouteChannel::of(settings, output.route),
             SubscriberRole::Lane(QueueLimits::of(lane)),
             true,
         )?;
-        let offer = Offer::of(lane, output.qos);
         let latched_offer = output.latched_qos.map(|qos| Offer::of(lane, qos));
         let mut opened = Self {
             id: route.id.to_string(),
@@ -149,17 +149,19 @@ impl Output {
             early: EarlySend::default(),
             partial: None,
             queued: 0,
-            tracker: SequenceTracker::resume(former.first_sequence, former.last_sequence),
-            drop_log: DropLog::new(former.drops),
+            tracker: SequenceTracker::resume(counters.get().first_sequence, counters.get().last_sequence),
+            drop_log: DropLog::new(counters.get().drops),
             counters,
             readers,
             overrun: Overrun::default(),
             is_held: lane.class() == TrafficClass::Critical && !former_readers.is_empty(),
             former_readers,
-            record: WriterRecord::of(role, participant, lane_index, output.route),
+            record,
+            former: Some(former_samples),
+            next: None,
             last_publisher: Guid::default(),
             unmatched: Vec::new(),
-            started_at: clock::monotonic(),
+            started_at,
             caught_up: false,
             ingress_starts: boards.health(ProcessRole::Ingress).map_or(0, |health| health.starts),
             shm: boards.histogram_writer(Stage::Shm(lane_index), output.route),
@@ -167,6 +169,9 @@ impl Output {
             age: boards.histogram_writer(Stage::Age(lane_index), output.route),
             boards,
         };
+        if opened.has_nothing_to_collect() {
+            opened.close_former_account(false, started_at);
+        }
         match &route.message_type {
             // The type of a place is known with its topic.
             Some(message_type) if !opened.topic.is_place => {
@@ -187,21 +192,17 @@ impl Output {
     /// because the new writer needs them for late joiners. After a restart, a critical lane takes none before
     /// its former readers have matched.
     pub fn take(&mut self) -> Option<ShmSample> {
-        if self.is_held && self.is_still_held() {
+        if self.collects_former() || (self.is_held && self.is_still_held()) {
             return None;
         }
         loop {
-            let sample = match self.subscriber.take() {
+            let taken = self.next.take().map_or_else(|| self.subscriber.take(), |next| Ok(Some(next)));
+            let sample = match taken {
                 Ok(Some(sample)) => sample,
                 // The borrow limit loses nothing: the samples stay in the channel.
                 Ok(None) | Err(TakeError::BorrowLimit) => return None,
                 Err(failure) => {
-                    error!(
-                        route = self.id,
-                        lane = self.lane,
-                        ?failure,
-                        "skipped an unusable sample in shared memory"
-                    );
+                    self.log_unusable(failure);
                     continue;
                 }
             };
@@ -226,6 +227,10 @@ impl Output {
             self.follow_publisher(sample.header().writer_guid);
             return Some(sample);
         }
+    }
+
+    fn log_unusable(&self, failure: TakeError) {
+        error!(route = self.id, lane = self.lane, ?failure, "skipped an unusable sample in shared memory");
     }
 
     /// Reads how much of a large sample has arrived.
@@ -326,6 +331,9 @@ impl Output {
         let kept = self.history.as_ref().and_then(|history| history.kept(&payload, &header));
         let publisher = self.history.as_ref().map(|_| header.writer_guid);
         let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
+        if let Some(record) = &self.record {
+            record.writing(header.sequence);
+        }
         let completes = self.early.end();
         let outcome = if completes {
             // A writer that refuses the sample withdraws it.
@@ -336,6 +344,7 @@ impl Output {
         let complete = self.former_readers.is_empty();
         let done_at = clock::monotonic();
         let forwarded = Forwarded {
+            number: outcome.map_or(0, |written| written.sequence),
             bytes: bytes as u64,
             by_reference,
             caught_up: header.published_at < self.started_at,
@@ -351,11 +360,15 @@ impl Output {
             match outcome {
                 Ok(written) if written.readers == 0 || !complete => {
                     counters.drops.add(DropReason::NoReader, 1);
+                    counters.accounted_number = written.sequence;
                 }
                 Ok(written) if written.sequence <= sent_through => count_forwarded(counters, &forwarded),
                 Ok(written) => {
                     let evicted = unsent.push(Unsent { sequence: written.sequence, account: forwarded });
-                    counters.drops.add(DropReason::WriteFailed, u64::from(evicted.is_some()));
+                    if let Some(evicted) = evicted {
+                        counters.drops.add(DropReason::WriteFailed, 1);
+                        counters.accounted_number = counters.accounted_number.max(evicted.number);
+                    }
                 }
                 Err(_) => {
                     counters.drops.add(DropReason::WriteFailed, 1);
@@ -432,13 +445,18 @@ impl Output {
         self.unsent.len() > 0
     }
 
-    /// Counts the unsent samples as dropped when the lane ends.
-    pub fn drop_unsent(&mut self) {
+    /// Counts the samples as dropped that are unsent when the lane ends.
+    pub fn shut_down(&mut self) {
+        self.close_former_account(false, clock::monotonic());
+        self.drop_unsent(DropReason::Shutdown);
+    }
+
+    fn drop_unsent(&mut self, reason: DropReason) {
         let unsent = self.unsent.clear() as u64;
         if unsent > 0 {
             let queued = self.queued;
             self.counters.update(|counters| {
-                counters.drops.add(DropReason::Shutdown, unsent);
+                counters.drops.add(reason, unsent);
                 counters.waiting = queued;
             });
         }

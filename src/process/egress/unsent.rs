@@ -59,6 +59,8 @@ impl<T> UnsentSamples<T> {
 
 /// What the account records of a sample when it is sent.
 pub(super) struct Forwarded {
+    /// Its RTPS sequence number.
+    pub number: i64,
     pub bytes: u64,
     pub by_reference: bool,
     pub caught_up: bool,
@@ -68,6 +70,7 @@ pub(super) struct Forwarded {
 /// Counts a sample that was sent.
 pub(super) fn count_forwarded(counters: &mut LaneCounters, sample: &Forwarded) {
     counters.forwarded += 1;
+    counters.accounted_number = counters.accounted_number.max(sample.number);
     counters.forwarded_bytes += sample.bytes;
     counters.by_reference += u64::from(sample.by_reference);
     counters.caught_up += u64::from(sample.caught_up);

@@ -178,6 +178,10 @@ pub struct LaneCounters {
     /// Of those, the ones that it gave up, because another sample came first or they never became complete.
     /// Those that became complete later were sent as a whole.
     pub withdrawn: u64,
+    /// The highest RTPS sequence number of a sample that is forwarded or dropped. The next process of the
+    /// lane sends the samples after it that are in the send log.
+    #[serde(skip)]
+    pub accounted_number: i64,
 }
 
 impl LaneCounters {

@@ -12,8 +12,9 @@ const DDS_TYPE: DdsType<'static> =
 fn record(role: &Role) -> WriterRecord {
     WriterRecord {
         board: role.boards.writer_identity_writer(LANE, 0),
-        number: role.boards.sent_number(LANE, 0),
+        log: role.boards.send_log(LANE, 0),
         route: 0,
+        writing: Arc::default(),
         had_writer: false,
     }
 }
@@ -30,12 +31,12 @@ fn a_writer_continues_the_numbers_of_the_former_process_if_it_is_the_same_writer
     let first = next(&mut record(&role), ours, "rt/a", &qos);
     assert_eq!(first.highest_number, 0);
     for number in 1..=41 {
-        (first.on_number)(number);
+        (first.on_number)(number, true);
     }
     // The process was killed. Each record is that of a next process.
     let second = next(&mut record(&role), ours, "rt/a", &qos);
     assert_eq!((second.key, second.highest_number), (first.key, 41));
-    (second.on_number)(42);
+    (second.on_number)(42, true);
     let third = next(&mut record(&role), ours, "rt/a", &qos);
     assert_eq!((third.key, third.highest_number), (first.key, 42));
 
@@ -47,7 +48,7 @@ fn a_writer_continues_the_numbers_of_the_former_process_if_it_is_the_same_writer
         let other = next(&mut record(&role), participant, topic, qos);
         assert_eq!(other.highest_number, 0, "{topic}");
         assert!(!keys.contains(&other.key), "{topic}");
-        (other.on_number)(7);
+        (other.on_number)(7, true);
         keys.push(other.key);
     }
 
@@ -63,8 +64,30 @@ fn a_writer_continues_the_numbers_of_the_former_process_if_it_is_the_same_writer
     assert_ne!(after.key, again.key);
 
     // A number that no process writes.
-    role.boards.sent_number(LANE, 0).set(i64::MIN);
+    role.boards.send_log(LANE, 0).record(i64::MIN, 1);
     assert_eq!(next(&mut record(&role), ours, "rt/a", &qos).highest_number, 0);
+}
+
+#[test]
+fn the_log_has_the_last_samples_that_were_written() {
+    let (role, ..) = test_role::open(ProcessRole::Egress(LANE), "egress", 73, SCAN);
+    let log = role.boards.send_log(LANE, 0);
+    let mut process = record(&role);
+    let writer = process.next(Guid([1; 16]), "rt/a", &DDS_TYPE, &QosProfile::CRITICAL);
+    for number in 1..=300 {
+        process.writing(number as u64 * 2);
+        // Of each tenth number only the beginning was sent.
+        (writer.on_number)(number, number % 10 != 0);
+    }
+    let logged = record(&role).logged();
+    let expected = (46..=300).filter(|number| number % 10 != 0).map(|number| (number, number as u64 * 2));
+    assert_eq!(logged, expected.collect::<Vec<_>>());
+    assert!(process.logged().is_empty(), "it is the one that has written them");
+    // What no process writes.
+    for (number, sequence) in [(301, 2), (i64::MIN, 1), (-1, 1), (i64::MAX, 1)] {
+        log.record(number, sequence);
+        assert!(record(&role).logged().is_empty(), "{number}");
+    }
 }
 
 #[test]
@@ -98,10 +121,10 @@ fn an_identity_is_given_up_if_others_may_not_know_it_or_it_has_changed() {
 }
 
 #[test]
-fn a_lane_that_is_not_told_to_keeps_no_identity() {
-    let (mut role, settings, _folder) = test_role::open(ProcessRole::Egress(LANE), "egress", 72, SCAN);
-    let options = participant_options(&settings, &settings.lanes[LANE].network, "egress");
-    let (participant, identity) = Identity::join(&mut role, &settings, LANE, &options).unwrap();
+fn a_noncritical_lane_keeps_no_identity() {
+    let (mut role, settings, _folder) = test_role::open(ProcessRole::Egress(1), "egress", 72, SCAN);
+    let options = participant_options(&settings, &settings.lanes[1].network, "egress");
+    let (participant, identity) = Identity::join(&mut role, &settings, 1, &options).unwrap();
     assert!(identity.is_none());
-    assert!(WriterRecord::of(&role, &participant, LANE, 0).is_none());
+    assert!(WriterRecord::of(&role, &participant, 1, 0).is_none());
 }

@@ -8,6 +8,7 @@ use super::super::offer::Offer;
 use super::super::overrun::Overrun;
 use super::super::unsent::UnsentSamples;
 use super::Output;
+use crate::clock;
 use crate::dds::{Participant, RawWriter};
 use crate::model::{DdsType, DropReason, Durability, Guid};
 
@@ -87,12 +88,7 @@ impl Output {
         let Some(info) = self.boards.route_info(self.route) else { return };
         let Some(topic) = self.topic.next(&info) else { return };
         self.count_sent();
-        let unsent = self.unsent.clear() as u64;
-        let queued = self.queued;
-        self.counters.update(|counters| {
-            counters.drops.add(DropReason::NoWriter, unsent);
-            counters.waiting = queued;
-        });
+        self.drop_unsent(DropReason::NoWriter);
         if let Some(former) = self.writer.take() {
             self.remove_writer(former, participant);
             participant.forget_topic(&self.topic.dds_topic);
@@ -142,13 +138,32 @@ impl Output {
         participant: &mut Participant,
         dds_type: DdsType,
     ) -> Result<(), RoleError> {
-        let Offer { qos, window_samples, supersedes } = &self.offer;
-        let topic = &self.topic.dds_topic;
-        let writer = match &mut self.record {
-            None => participant.create_writer(topic, dds_type, qos, *window_samples)?,
-            Some(record) => {
-                let continuation = record.next(participant.guid(), topic, &dds_type, qos);
-                participant.create_writer_continuing(topic, dds_type, qos, *window_samples, continuation)?
+        let now = clock::monotonic();
+        if self.former.as_ref().is_some_and(|former| !former.is_complete(now)) {
+            return Ok(());
+        }
+        let Offer { qos, window_samples, supersedes } = self.offer;
+        let continuation = self
+            .record
+            .as_mut()
+            .map(|record| record.next(participant.guid(), &self.topic.dds_topic, &dds_type, &qos));
+        let writer = match continuation {
+            None => participant.create_writer(&self.topic.dds_topic, dds_type, &qos, window_samples)?,
+            Some(mut continuation) => {
+                let is_continued = continuation.highest_number > 0;
+                if !is_continued {
+                    self.counters.update(|counters| counters.accounted_number = 0);
+                }
+                continuation.sent_through = self.counters.get().accounted_number;
+                continuation.samples = self.close_former_account(is_continued, now);
+                continuation.readers = self.former_readers.missing().to_vec();
+                let topic = &self.topic.dds_topic;
+                let created =
+                    participant.create_writer_continuing(topic, dds_type, &qos, window_samples, continuation);
+                if created.is_err() {
+                    self.drop_unsent(DropReason::WriteFailed);
+                }
+                created?
             }
         };
         info!(
@@ -161,7 +176,7 @@ impl Output {
             durability = ?qos.durability,
             "DDS writer created"
         );
-        if *supersedes {
+        if supersedes {
             writer.skip_evicted();
         }
         self.writer = Some(writer);

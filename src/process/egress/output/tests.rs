@@ -1,5 +1,7 @@
 //! The account of an output, with real shared memory and a real DDS writer.
 
+mod former;
+
 use super::*;
 use crate::config::DropPolicy;
 use crate::dds::{RawReader, ReaderQos};
@@ -110,7 +112,8 @@ fn dropped(output: &Output, reason: DropReason) -> u64 {
 
 fn unsent(sequence: i64) -> Unsent<Forwarded> {
     let written_at = clock::monotonic();
-    Unsent { sequence, account: Forwarded { bytes: 7, by_reference: false, caught_up: false, written_at } }
+    let account = Forwarded { number: sequence, bytes: 7, by_reference: false, caught_up: false, written_at };
+    Unsent { sequence, account }
 }
 
 #[test]
@@ -225,7 +228,7 @@ fn samples_wait_until_they_are_sent_or_the_lane_ends() {
     output.tracker.record(5);
     output.set_queued(3);
     assert_eq!((output.counters.get().first_sequence, output.counters.get().last_sequence), (4, 5));
-    output.drop_unsent();
+    output.shut_down();
     assert_eq!((counted(&output), dropped(&output, DropReason::Shutdown)), ((1, 3), 1));
     output.unsent.push(unsent(0));
     assert!(!output.count_sent());

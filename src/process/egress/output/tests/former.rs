@@ -1,0 +1,60 @@
+//! What a killed process of a lane that keeps its identity leaves to the next one.
+
+use super::*;
+use crate::model::LaneIdentity;
+
+/// The account of the first three processes of a lane that keeps its identity: the second one continues the
+/// writer of the first, of which the last sample is in the log and not counted, and the third one another.
+#[test]
+fn a_killed_process_leaves_its_samples_with_their_numbers() {
+    let mut host = Host::start(150, CRITICAL, SCAN);
+    host.announce_type();
+    let identity = LaneIdentity { participant: host.participant.guid(), ..LaneIdentity::default() };
+    host.role.boards.lane_identity_writer(CRITICAL).set(identity.sealed());
+    let mut first = host.open();
+    for sequence in 11..=14 {
+        host.publish_next(sequence);
+    }
+    for _ in 11..=13 {
+        host.send(&mut first);
+    }
+    assert_eq!(dropped(&first, DropReason::NoReader), 3);
+    // Of the fourth one it records the number, begins to send it, and is killed.
+    let log = host.role.boards.send_log(CRITICAL, 0);
+    log.record(4, 14);
+    assert_eq!(log.samples(), [(1, 11), (2, 12), (3, 13), (4, 14)]);
+    drop(first);
+
+    let mut second = host.open();
+    assert!(second.writer.is_none() && second.take().is_none(), "it collects the samples first");
+    wait_until("the former samples", || {
+        host.publisher.connect_subscribers();
+        second.collect_former(&mut host.participant, &mut host.arena);
+        !second.collects_former()
+    });
+    assert!(second.writer.is_some());
+    wait_until("the sample that was not counted", || !second.count_sent());
+    let counters = *second.counters.get();
+    assert_eq!((counters.received(), counters.forwarded, counters.accounted_number), (4, 1, 4));
+    assert_eq!(counters.drops.total(), 3, "none is lost with the process");
+    assert!(counters.is_accounted_for());
+    host.publish_next(15);
+    assert_eq!(second.take().unwrap().header().sequence, 15);
+    host.publish_next(16);
+    host.send(&mut second);
+    assert_eq!(log.samples().last(), Some(&(5, 16)), "the numbers go on");
+    drop(second);
+
+    // Another type is another writer: nothing is repeated, and what was not counted is lost.
+    log.record(6, 17);
+    host.announce(|info| info.dds_type = FixedText::new("test::msg::dds_::Other_"));
+    let mut third = host.open();
+    wait_until("the end of the wait", || {
+        third.collect_former(&mut host.participant, &mut host.arena);
+        !third.collects_former()
+    });
+    let counters = *third.counters.get();
+    assert!(counters.is_accounted_for(), "{counters:?}");
+    assert_eq!((counters.last_sequence, counters.waiting, counters.accounted_number), (17, 0, 0));
+    assert_eq!((log.highest(), log.samples()), (0, vec![]));
+}
