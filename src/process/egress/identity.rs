@@ -224,8 +224,9 @@ pub(super) struct WriterRecord {
     route: usize,
     /// The sequence number in the route of the sample that is being written.
     writing: Arc<AtomicU64>,
-    /// Whether this process has had a writer, which has said goodbye when it has another one.
-    had_writer: bool,
+    /// Whether the next writer may be that of the former process: the participant is, and this process has had
+    /// no writer, which would have said goodbye.
+    may_continue: bool,
 }
 
 impl WriterRecord {
@@ -237,7 +238,7 @@ impl WriterRecord {
             log: role.boards.send_log(lane, route),
             route,
             writing: Arc::default(),
-            had_writer: false,
+            may_continue: role.former.participant == participant.guid(),
         })
     }
 
@@ -254,7 +255,7 @@ impl WriterRecord {
 
     fn is_continuable(&self) -> bool {
         let former = self.board.get();
-        !self.had_writer
+        self.may_continue
             && former.is_intact()
             && former.count > 0
             && (0..i64::MAX / 2).contains(&self.log.highest())
@@ -274,7 +275,7 @@ impl WriterRecord {
         let offer = hasher.finish();
         let former = *self.board.get();
         let is_former = self.is_continuable() && former.offer == offer;
-        self.had_writer = true;
+        self.may_continue = false;
         if !is_former {
             // In this order: no number goes with the wrong writer if the process dies in between.
             self.board.set(WriterIdentity::default());

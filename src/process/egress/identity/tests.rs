@@ -15,7 +15,7 @@ fn record(role: &Role) -> WriterRecord {
         log: role.boards.send_log(LANE, 0),
         route: 0,
         writing: Arc::default(),
-        had_writer: false,
+        may_continue: true,
     }
 }
 

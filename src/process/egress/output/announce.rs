@@ -154,8 +154,8 @@ impl Output {
                 if !is_continued {
                     self.counters.update(|counters| counters.accounted_number = 0);
                 }
-                continuation.sent_through = self.counters.get().accounted_number;
                 continuation.samples = self.close_former_account(is_continued, now);
+                continuation.sent_through = self.counters.get().accounted_number;
                 continuation.readers = self.former_readers.missing().to_vec();
                 let topic = &self.topic.dds_topic;
                 let created =

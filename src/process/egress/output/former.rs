@@ -10,7 +10,6 @@ use super::Output;
 use crate::clock;
 use crate::dds::{FormerSample, Participant};
 use crate::model::{DropReason, MonotonicNs};
-use crate::policy::{SequenceOutcome, SequenceTracker};
 use crate::shm::TakeError;
 
 impl Output {
@@ -84,49 +83,42 @@ impl Output {
         }
         former.keep_contiguous();
         let last_logged = former.last_sequence();
-        let (accounted, had_taken) = {
-            let counters = self.counters.get();
-            (counters.accounted_number, counters.last_sequence)
-        };
-        let (mut missing, mut to_send, mut to_send_taken) = (0, Vec::new(), 0);
-        let record = |tracker: &mut SequenceTracker, sequence| match tracker.record(sequence) {
-            SequenceOutcome::AfterGap(gap) => gap,
-            SequenceOutcome::InOrder | SequenceOutcome::Duplicate => 0,
-        };
-        for collected in &former.collected {
-            if collected.sample.number > accounted {
-                missing += record(&mut self.tracker, collected.sequence);
-                to_send_taken += u64::from(collected.sequence <= had_taken);
-                to_send.push(Unsent {
-                    sequence: collected.sample.number,
-                    account: Forwarded {
-                        number: collected.sample.number,
-                        bytes: collected.sample.payload.len() as u64,
-                        by_reference: collected.by_reference,
-                        caught_up: false,
-                        written_at: now,
-                    },
-                });
-            }
+        let accounted = self.counters.get().accounted_number;
+        let counted = former.collected.partition_point(|collected| collected.sample.number <= accounted);
+        let (repairable, uncounted) = former.collected.split_at(counted);
+        for collected in uncounted {
+            self.tracker.record(collected.sequence);
         }
-        if last_logged > self.tracker.last() {
-            // It was sent, and is not there any more.
-            missing += record(&mut self.tracker, last_logged) + 1;
-        }
-        let repairable = former.collected.len() - to_send.len();
+        // The last one that was sent may not be there any more.
+        self.tracker.record(last_logged);
+        let has_readers = !self.former_readers.is_empty();
         let (unsent, tracker) = (&mut self.unsent, &self.tracker);
         self.counters.update(|counters| {
-            let counted = counters.forwarded + counters.drops.total();
-            let lost = counters.received().saturating_sub(counted + to_send_taken);
-            counters.drops.add(DropReason::LaneDown, lost + missing);
-            for sample in to_send {
-                if let Some(evicted) = unsent.push(sample) {
-                    counters.drops.add(DropReason::WriteFailed, 1);
-                    counters.accounted_number = counters.accounted_number.max(evicted.number);
+            record_sequence(counters, tracker);
+            let known = counters.forwarded + counters.drops.total() + uncounted.len() as u64;
+            counters.drops.add(DropReason::LaneDown, counters.received().saturating_sub(known));
+            for collected in uncounted {
+                let number = collected.sample.number;
+                let account = Forwarded {
+                    number,
+                    bytes: collected.sample.payload.len() as u64,
+                    by_reference: collected.by_reference,
+                    caught_up: false,
+                    written_at: now,
+                };
+                let dropped = if has_readers {
+                    let evicted = unsent.push(Unsent { sequence: number, account });
+                    evicted.map(|evicted| (DropReason::WriteFailed, evicted.number))
+                } else {
+                    Some((DropReason::NoReader, number))
+                };
+                if let Some((reason, number)) = dropped {
+                    counters.drops.add(reason, 1);
+                    counters.accounted_number = number;
                 }
             }
-            counters.unconfirmed += former.unconfirmed.saturating_sub(repairable as u64);
-            record_sequence(counters, tracker);
+            let unconfirmed = former.unconfirmed.saturating_sub(repairable.len() as u64);
+            counters.unconfirmed = counters.unconfirmed.saturating_add(unconfirmed);
             counters.waiting = unsent.len() as u64;
             counters.readers = 0;
         });
