@@ -284,8 +284,8 @@ fn samples_that_a_killed_critical_egress_had_not_repaired_are_counted_as_unconfi
     assert!(missed.into_iter().any(|missed| missed > dropped + 50), "the lane repaired all: {account}");
 }
 
-/// Kills the critical egress at the end of an outage of its subscribers. Returns how many samples each of them
-/// missed, and how many count as dropped and as unconfirmed.
+/// Kills the critical egress at the end of an outage of its subscribers. Returns how many samples each of
+/// them missed, and how many count as dropped and as unconfirmed.
 fn kill_during_an_outage(test: &str, yaml: &str) -> Option<([u64; 3], u64, u64)> {
     let bed = bed_with(test, yaml)?;
     let subscribers = LIBRARIES.map(|library| subscribe(&bed, "slow", library, "planner", CRITICAL));

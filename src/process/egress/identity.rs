@@ -224,8 +224,8 @@ pub(super) struct WriterRecord {
     route: usize,
     /// The sequence number in the route of the sample that is being written.
     writing: Arc<AtomicU64>,
-    /// Whether the next writer may be that of the former process: the participant is, and this process has had
-    /// no writer, which would have said goodbye.
+    /// Whether the next writer may be that of the former process: the participant is, and this process has
+    /// had no writer, which would have said goodbye.
     may_continue: bool,
 }
 

@@ -3,8 +3,8 @@
 use super::*;
 use crate::model::LaneIdentity;
 
-/// The account of processes of a lane that keeps its identity. Each of the first three leaves a sample that is
-/// in the log and not counted; the last one has another writer.
+/// The account of processes of a lane that keeps its identity. Each of the first three leaves a sample that
+/// is in the log and not counted; the last one has another writer.
 #[test]
 fn a_killed_process_leaves_its_samples_with_their_numbers() {
     let mut host = Host::start(150, CRITICAL, SCAN);
