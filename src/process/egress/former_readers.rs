@@ -53,8 +53,13 @@ impl FormerReaders {
 
     /// Whether samples have to wait for those that are missing. Not for readers that the board had no room
     /// for: no event tells when the last one of them has matched.
-    pub fn holds(&self, now: MonotonicNs) -> bool {
-        !self.missing.is_empty() && now < self.hold_ends_at
+    pub fn hold(&self, now: MonotonicNs) -> bool {
+        !self.missing.is_empty() && self.may_hold(now)
+    }
+
+    /// Whether samples may still have to wait.
+    pub fn may_hold(&self, now: MonotonicNs) -> bool {
+        now < self.hold_ends_at
     }
 
     /// Removes a reader that has matched.
@@ -160,11 +165,11 @@ mod tests {
     fn samples_wait_for_readers_that_may_match_in_time() {
         let board = matched(&mut first(), [0, 1]);
         let mut process = FormerReaders::of(&board, at(500));
-        assert!(process.holds(at(500 + HOLD_MS - 1)) && !process.holds(at(500 + HOLD_MS)));
+        assert!(process.hold(at(500 + HOLD_MS - 1)) && !process.hold(at(500 + HOLD_MS)));
         process.matched(guid(0));
-        assert!(process.holds(at(500)));
+        assert!(process.hold(at(500)));
         process.matched(guid(1));
-        assert!(!process.holds(at(500)) && !first().holds(at(0)));
+        assert!(!process.hold(at(500)) && !first().hold(at(0)));
     }
 
     #[test]

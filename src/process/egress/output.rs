@@ -431,6 +431,10 @@ impl Output {
         if self.unsent.len() == 0 {
             return false;
         }
+        // Those of the former process count when its readers have them.
+        if self.is_held {
+            return true;
+        }
         let sent_through = self.writer.as_ref().map_or(i64::MAX, RawWriter::sent_through);
         if let Some(first) = self.unsent.pop_sent(sent_through) {
             let (unsent, queued) = (&mut self.unsent, self.queued);

@@ -6,7 +6,8 @@
 
 use super::Output;
 use crate::clock;
-use crate::model::{SampleHeader, TrafficClass};
+use crate::dds::RawWriter;
+use crate::model::{ReaderRecord, SampleHeader, TrafficClass};
 use crate::policy::is_stale;
 
 /// Older samples are left out, except for the last [`ANY_AGE_SAMPLES`]. At 1 Hz ingress retains those of some
@@ -31,10 +32,21 @@ impl Output {
     pub(super) fn is_still_held(&mut self) -> bool {
         let now = clock::monotonic();
         self.follow_matching(now);
-        let waits = self.writer.is_some() && self.history.is_none() && self.former_readers.holds(now);
+        let waits = self.history.is_none()
+            && self.writer.as_ref().is_some_and(|writer| {
+                self.former_readers.hold(now)
+                    || (self.former_readers.may_hold(now) && self.lack_former(writer))
+            });
         // The readers that have matched must not lose samples to the others.
         self.is_held = waits && (self.counters.get().readers == 0 || !self.is_queue_nearly_full());
         self.is_held
+    }
+
+    /// Whether matched readers lack samples of the former process that are not counted yet. The library sends
+    /// them before the readers have matched, to nobody, and repairs them after that.
+    fn lack_former(&self, writer: &RawWriter) -> bool {
+        let lacks = |reader: ReaderRecord| reader.reliable == 1 && reader.unacknowledged > 0;
+        self.unsent.len() > 0 && writer.matched_readers().any(lacks)
     }
 
     fn is_queue_nearly_full(&self) -> bool {
