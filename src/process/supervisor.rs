@@ -5,7 +5,8 @@
 //! supervisor: each asks the kernel for SIGTERM when its parent dies, whatever the parent dies of.
 
 use std::ffi::OsString;
-use std::io::{self, BufRead, BufReader, Write};
+use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
+use std::os::unix::net::UnixStream;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -14,6 +15,7 @@ use std::time::Duration;
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::{Pid, getppid};
+use signal_hook::consts::SIGCHLD;
 use tracing::{error, info, warn};
 
 use super::in_force::{FOLDER_VARIABLE, InForce};
@@ -27,7 +29,7 @@ use crate::policy::{ChildExit, GiveUpReason, HangWatch, RestartBackoff, RestartD
 use crate::shm::{RoleLock, ShmError, root_of};
 use crate::telemetry::{Snapshot, Threads};
 
-/// Interval at which the supervisor checks its children.
+/// Interval at which the supervisor checks for requests, and its children if no signal tells that one ended.
 const POLL_MS: u64 = 20;
 
 /// Interval of reading the boards, for the progress of the children and the service manager.
@@ -120,6 +122,7 @@ pub fn up(
         children.push(Supervised::new(&name, &own, arguments, &folder, hang_ms));
     }
     children.push(Supervised::new("control", &["control"], arguments, &folder, HANG_MS));
+    let mut child_ends = ChildEnds::watch();
     let mut outcome = Ok(());
     for child in &mut children {
         if let Err(error) = child.start() {
@@ -129,8 +132,7 @@ pub fn up(
     }
     let mut report = ManagerReport::new(settings, watchdog);
     while outcome.is_ok() && !stop.is_requested() {
-        #[allow(clippy::disallowed_methods, reason = "the supervisor handles no samples")]
-        std::thread::sleep(Duration::from_millis(POLL_MS));
+        child_ends.wait();
         match hang_up.take() {
             Some(HangUpMeaning::Reload) => {
                 info!("reload: SIGHUP sent to every child");
@@ -154,6 +156,34 @@ pub fn up(
     report.notifier.stopping();
     let killed = stop_all(&mut children);
     if killed.is_empty() { outcome } else { outcome.and(Err(SupervisorError::Killed { names: killed })) }
+}
+
+/// Wakes the supervisor when a child ends.
+struct ChildEnds(Option<UnixStream>);
+
+impl ChildEnds {
+    /// Without the signal, or if it can't be read, the supervisor notices the end at its next check.
+    fn watch() -> Self {
+        let watch = || -> io::Result<UnixStream> {
+            let (woken, waker) = UnixStream::pair()?;
+            woken.set_read_timeout(Some(Duration::from_millis(POLL_MS)))?;
+            signal_hook::low_level::pipe::register(SIGCHLD, waker)?;
+            Ok(woken)
+        };
+        Self(watch().inspect_err(|error| warn!(%error, "cannot wait for the end of a child process")).ok())
+    }
+
+    /// Waits until a child ends, for [`POLL_MS`] at most.
+    fn wait(&mut self) {
+        let woken = self.0.as_mut().is_some_and(|woken| match woken.read(&mut [0; 64]) {
+            Ok(bytes) => bytes > 0,
+            Err(error) => matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted),
+        });
+        if !woken {
+            #[allow(clippy::disallowed_methods, reason = "the supervisor handles no samples")]
+            std::thread::sleep(Duration::from_millis(POLL_MS));
+        }
+    }
 }
 
 /// Reads the boards: kills children that hang, and reports the state of all children to the service
@@ -338,17 +368,8 @@ impl Supervised {
 
     /// Notices the end of the child, and restarts it when its backoff is over.
     fn poll(&mut self, now: MonotonicNs) {
-        match self.state {
-            State::RestartAt(at) if now >= at => {
-                self.backoff.started(now);
-                if let Err(error) = self.start() {
-                    error!(child = self.name, %error, "restart failed");
-                    // Counts as a child that fails at once.
-                    self.ended(ChildExit::Code(1), now);
-                }
-            }
-            State::GaveUp | State::RestartAt(_) => {}
-            State::Running => match self.process.as_mut().map(Child::try_wait) {
+        if self.state == State::Running {
+            match self.process.as_mut().map(Child::try_wait) {
                 Some(Ok(Some(status))) => {
                     self.process = None;
                     let exit = exit_of(status);
@@ -359,7 +380,17 @@ impl Supervised {
                     error!(child = self.name, %error, "cannot read the state of the child process");
                 }
                 Some(Ok(None)) | None => {}
-            },
+            }
+        }
+        if let State::RestartAt(at) = self.state
+            && now >= at
+        {
+            self.backoff.started(now);
+            if let Err(error) = self.start() {
+                error!(child = self.name, %error, "restart failed");
+                // Counts as a child that fails at once.
+                self.ended(ChildExit::Code(1), now);
+            }
         }
     }
 
