@@ -20,7 +20,7 @@ use super::history::{History, present_publishers};
 use super::identity::WriterRecord;
 use super::offer::{Offer, RouteDurability};
 use super::overrun::Overrun;
-use super::unsent::{Forwarded, Unsent, UnsentSamples, count_forwarded, record_sequence};
+use super::unsent::{Forwarded, UnsentSamples, count_forwarded, record_sequence};
 use crate::clock;
 use crate::config::{self, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter};
@@ -64,7 +64,7 @@ pub(super) struct Output {
     early: EarlySend,
     /// The board of a partial sample, read and not followed yet.
     partial: Option<PartialSample>,
-    unsent: UnsentSamples<Forwarded>,
+    unsent: UnsentSamples,
     /// Samples taken that wait for a token.
     queued: u64,
     /// `None` for a VOLATILE output.
@@ -77,7 +77,7 @@ pub(super) struct Output {
     /// `None` if the lane does not keep its identity.
     record: Option<WriterRecord>,
     /// While samples of the former process are collected.
-    former: Option<FormerSamples>,
+    former: Option<Box<FormerSamples>>,
     /// A sample that was taken and is the next one.
     next: Option<ShmSample>,
     /// Whether samples wait in the queue until the former readers have matched.
@@ -157,7 +157,7 @@ impl Output {
             is_held: lane.class() == TrafficClass::Critical && !former_readers.is_empty(),
             former_readers,
             record,
-            former: Some(former_samples),
+            former: Some(Box::new(former_samples)),
             next: None,
             last_publisher: Guid::default(),
             unmatched: Vec::new(),
@@ -363,8 +363,8 @@ impl Output {
                     counters.accounted_number = written.sequence;
                 }
                 Ok(written) if written.sequence <= sent_through => count_forwarded(counters, &forwarded),
-                Ok(written) => {
-                    let evicted = unsent.push(Unsent { sequence: written.sequence, account: forwarded });
+                Ok(_) => {
+                    let evicted = unsent.push(forwarded);
                     if let Some(evicted) = evicted {
                         counters.drops.add(DropReason::WriteFailed, 1);
                         counters.accounted_number = counters.accounted_number.max(evicted.number);

@@ -9,21 +9,13 @@ use std::collections::VecDeque;
 use crate::model::{LaneCounters, MonotonicNs};
 use crate::policy::SequenceTracker;
 
-/// A sample that waits to be sent, with what its account needs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Unsent<T> {
-    /// Its RTPS sequence number.
-    pub sequence: i64,
-    pub account: T,
-}
-
 /// The unsent samples of one writer, oldest first.
-pub(super) struct UnsentSamples<T> {
-    samples: VecDeque<Unsent<T>>,
+pub(super) struct UnsentSamples {
+    samples: VecDeque<Forwarded>,
     capacity: usize,
 }
 
-impl<T> UnsentSamples<T> {
+impl UnsentSamples {
     /// Room for as many samples as the writer's history holds.
     pub fn new(history_samples: usize) -> Self {
         let capacity = history_samples.max(1);
@@ -35,18 +27,18 @@ impl<T> UnsentSamples<T> {
     }
 
     /// Adds a sample, and returns the oldest one if the history has no room for both: it was evicted unsent.
-    pub fn push(&mut self, sample: Unsent<T>) -> Option<T> {
+    pub fn push(&mut self, sample: Forwarded) -> Option<Forwarded> {
         let evicted = if self.samples.len() == self.capacity { self.samples.pop_front() } else { None };
         self.samples.push_back(sample);
-        evicted.map(|old| old.account)
+        evicted
     }
 
     /// Removes the oldest sample if it was sent.
-    pub fn pop_sent(&mut self, sent_through: i64) -> Option<T> {
-        if self.samples.front()?.sequence > sent_through {
+    pub fn pop_sent(&mut self, sent_through: i64) -> Option<Forwarded> {
+        if self.samples.front()?.number > sent_through {
             return None;
         }
-        self.samples.pop_front().map(|sent| sent.account)
+        self.samples.pop_front()
     }
 
     /// Removes all samples and returns their number.
@@ -58,6 +50,7 @@ impl<T> UnsentSamples<T> {
 }
 
 /// What the account records of a sample when it is sent.
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Forwarded {
     /// Its RTPS sequence number.
     pub number: i64,
@@ -87,30 +80,29 @@ pub(super) fn record_sequence(counters: &mut LaneCounters, tracker: &SequenceTra
 mod tests {
     use super::*;
 
-    fn unsent(sequence: i64) -> Unsent<i64> {
-        Unsent { sequence, account: sequence * 10 }
+    fn unsent(number: i64) -> Forwarded {
+        Forwarded { number, bytes: 7, by_reference: false, caught_up: false, written_at: MonotonicNs(0) }
+    }
+
+    fn numbers(samples: impl IntoIterator<Item = Option<Forwarded>>) -> Vec<Option<i64>> {
+        samples.into_iter().map(|sample| sample.map(|sample| sample.number)).collect()
     }
 
     #[test]
     fn samples_are_removed_when_they_were_sent() {
         let mut samples = UnsentSamples::new(4);
-        for sequence in 3..=5 {
-            assert_eq!(samples.push(unsent(sequence)), None);
-        }
-        assert_eq!(samples.pop_sent(2), None);
-        assert_eq!(samples.pop_sent(4), Some(30));
-        assert_eq!(samples.pop_sent(4), Some(40));
-        assert_eq!(samples.pop_sent(4), None);
+        assert_eq!(numbers((3..=5).map(|number| samples.push(unsent(number)))), [None, None, None]);
+        let sent = [2, 4, 4, 4].map(|sent_through| samples.pop_sent(sent_through));
+        assert_eq!(numbers(sent), [None, Some(3), Some(4), None]);
         assert_eq!(samples.len(), 1);
         assert_eq!(samples.clear(), 1);
-        assert_eq!(samples.pop_sent(i64::MAX), None);
+        assert!(samples.pop_sent(i64::MAX).is_none());
     }
 
     #[test]
     fn a_full_history_evicts_the_oldest() {
         let mut samples = UnsentSamples::new(2);
-        assert_eq!((samples.push(unsent(1)), samples.push(unsent(2))), (None, None));
-        assert_eq!(samples.push(unsent(3)), Some(10));
+        assert_eq!(numbers((1..=3).map(|number| samples.push(unsent(number)))), [None, None, Some(1)]);
         assert_eq!(samples.len(), 2);
     }
 }

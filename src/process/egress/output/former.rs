@@ -5,7 +5,7 @@ use bytes::Bytes;
 
 use super::super::arena::CopyArena;
 use super::super::former_samples::Collected;
-use super::super::unsent::{Forwarded, Unsent, record_sequence};
+use super::super::unsent::{Forwarded, record_sequence};
 use super::Output;
 use crate::clock;
 use crate::dds::{FormerSample, Participant};
@@ -107,7 +107,7 @@ impl Output {
                     written_at: now,
                 };
                 let dropped = if has_readers {
-                    let evicted = unsent.push(Unsent { sequence: number, account });
+                    let evicted = unsent.push(account);
                     evicted.map(|evicted| (DropReason::WriteFailed, evicted.number))
                 } else {
                     Some((DropReason::NoReader, number))

@@ -110,10 +110,9 @@ fn dropped(output: &Output, reason: DropReason) -> u64 {
     output.counters.get().drops.get(reason)
 }
 
-fn unsent(sequence: i64) -> Unsent<Forwarded> {
+fn unsent(number: i64) -> Forwarded {
     let written_at = clock::monotonic();
-    let account = Forwarded { number: sequence, bytes: 7, by_reference: false, caught_up: false, written_at };
-    Unsent { sequence, account }
+    Forwarded { number, bytes: 7, by_reference: false, caught_up: false, written_at }
 }
 
 #[test]

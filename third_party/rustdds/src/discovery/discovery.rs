@@ -1220,8 +1220,8 @@ impl Discovery {
     });
   }
 
-  // At once: peers answer a participant that is new to them, and until then nobody
-  // matches its endpoints. It goes to the multicast address of our own built-in
+  // Without a delay: peers match the endpoints of a participant after they have received
+  // its announcement. It goes to the multicast address of our own built-in
   // reader, of which `initialize_participant` has told the event loop before.
   fn announce_first(&self) {
     if let Some(dp) = self.domain_participant.clone().upgrade() {

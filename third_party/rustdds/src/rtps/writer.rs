@@ -5031,7 +5031,7 @@ mod tests {
       assert_eq!((reader.offered, reader.unacknowledged, reader.overrun), (3, 3, 0));
       // One that lacks the last samples of the former process requests them.
       acknowledge(&mut f, 40, &[40, 41, 43], 2);
-      assert_eq!(f.repair_round(), 1, "only what there is");
+      assert_eq!(f.repair_round(), 1, "of the three numbers it has one");
       acknowledge(&mut f, 45, &[], 3);
       let reader = only_reader(&f);
       assert_eq!((reader.offered, reader.unacknowledged, reader.overrun), (3, 0, 0));
