@@ -81,6 +81,7 @@ fn role(
     arguments: &ConfigArguments,
     role: impl FnOnce(&Configuration, ReloadRequests, &Stop) -> Result<(), RoleError>,
 ) -> Result<ExitCode, ExitCode> {
+    process::bound_free_memory();
     let reload_arguments = arguments.clone();
     let reloads = ReloadRequests::on_signal(move |set| reload_arguments.try_load_with(set))
         .map_err(|error| failed(&error))?;

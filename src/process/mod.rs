@@ -5,6 +5,7 @@
 //! process sleeps until it is woken or until its next housekeeping. Housekeeping is the work that is not
 //! needed for each sample: discovery, matching, logs, health.
 
+mod allocator;
 mod control;
 mod count_log;
 mod egress;
@@ -25,6 +26,7 @@ mod supervisor;
 #[cfg(test)]
 mod test_role;
 
+pub use allocator::bound_free_memory;
 pub use control::control;
 pub use egress::{egress, end_unused};
 pub use in_force::{InForce, InForceError};

@@ -63,7 +63,6 @@ pub(super) fn apply(scheduling: &Scheduling) {
             ),
         }
     }
-    return_large_blocks();
     if scheduling.lock_memory {
         match lock_memory() {
             Ok(()) => info!("memory locked"),
@@ -73,28 +72,6 @@ pub(super) fn apply(scheduling: &Scheduling) {
         }
     }
 }
-
-/// The size from which the allocator returns a freed block to the kernel: its default, which it otherwise
-/// raises to that of the largest block freed. The DDS library receives into blocks of 256 KiB. When more of
-/// them were in use than ever before, such as for the announcements of a hundred participants that join
-/// together, the process kept their memory: with 9,500 participants that came and went, ingress grew by 1.6
-/// MiB and control by 2.4, and now by 0.8 and 1.3.
-#[cfg(target_env = "gnu")]
-const RETURNED_BYTES: libc::c_int = 128 << 10;
-
-/// Makes the allocator return large blocks to the kernel when they are freed.
-#[cfg(target_env = "gnu")]
-fn return_large_blocks() {
-    // SAFETY: the call takes two numbers, and changes which blocks the allocator maps on their own. It may
-    // be called at any time and by any thread.
-    let is_set = unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, RETURNED_BYTES) } == 1;
-    if !is_set {
-        debug!("the allocator keeps the memory of large blocks that were freed");
-    }
-}
-
-#[cfg(not(target_env = "gnu"))]
-fn return_large_blocks() {}
 
 /// Locks the present memory of the process, and what it maps later as soon as that is touched. Without
 /// `MCL_ONFAULT` the kernel would allocate each pool completely, for samples of the largest size.

@@ -23,6 +23,7 @@ const UNSAFE: &[&str] = &[
     "src/shm/subscriber.rs",
     "src/shm/wake.rs",
     // System calls without a safe wrapper.
+    "src/process/allocator.rs",
     "src/process/scheduling.rs",
     // Code of a child process between fork and exec.
     "benches/hop/beds.rs",
