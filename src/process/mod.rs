@@ -11,6 +11,7 @@ mod count_log;
 mod egress;
 mod in_force;
 mod ingress;
+mod kept_sockets;
 mod lane_override;
 mod memory;
 mod memory_limit;
@@ -21,6 +22,7 @@ mod reload;
 mod responder;
 mod role;
 mod scheduling;
+mod socket_store;
 mod stop;
 mod supervisor;
 #[cfg(test)]

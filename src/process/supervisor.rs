@@ -21,6 +21,7 @@ use tracing::{error, info, warn};
 use super::in_force::{FOLDER_VARIABLE, InForce};
 use super::notify::{Notifier, write_list};
 use super::reload::{HangUp, HangUpMeaning, with_hang_up_blocked};
+use super::socket_store::{self, SocketStore};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{Configuration, Settings};
@@ -114,12 +115,16 @@ pub fn up(
     // The lock file tells another `up` the process id of this one.
     let _lock = RoleLock::acquire(&root, &settings.instance, "up")?;
     let folder = root.join(settings.instance.as_str());
-    let mut children = vec![Supervised::new("ingress", &["ingress"], arguments, &folder, HANG_CRITICAL_MS)];
+    let ingress = Supervised::new("ingress", &["ingress"], arguments, &folder, HANG_CRITICAL_MS);
+    let mut children = vec![ingress.keep_sockets()];
     for lane in settings.lanes.iter().filter(|lane| lane.is_used()) {
         let name = format!("egress-{}", lane.name);
         let own = ["egress", "--lane", lane.name.as_str()];
-        let hang_ms = if lane.class() == TrafficClass::Critical { HANG_CRITICAL_MS } else { HANG_MS };
-        children.push(Supervised::new(&name, &own, arguments, &folder, hang_ms));
+        children.push(if lane.class() == TrafficClass::Critical {
+            Supervised::new(&name, &own, arguments, &folder, HANG_CRITICAL_MS).keep_sockets()
+        } else {
+            Supervised::new(&name, &own, arguments, &folder, HANG_MS)
+        });
     }
     children.push(Supervised::new("control", &["control"], arguments, &folder, HANG_MS));
     let mut child_ends = ChildEnds::watch();
@@ -313,6 +318,8 @@ struct Supervised {
     start_watch: HangWatch,
     /// Its threads at the last check, and when that was.
     threads: Option<(Threads, MonotonicNs)>,
+    /// The sockets that its next process inherits.
+    sockets: Option<SocketStore>,
 }
 
 impl Supervised {
@@ -331,7 +338,16 @@ impl Supervised {
             hang_watch: HangWatch::new(hang_ms, now),
             start_watch: HangWatch::new(START_MS, now),
             threads: None,
+            sockets: None,
         }
+    }
+
+    /// Keeps the sockets that the child stores, for its next process.
+    fn keep_sockets(mut self) -> Self {
+        let opened = SocketStore::open();
+        let warn = |error: &io::Error| warn!(child = self.name, %error, "cannot keep sockets of this child");
+        self.sockets = opened.inspect_err(warn).ok();
+        self
     }
 
     fn start(&mut self) -> io::Result<()> {
@@ -341,13 +357,12 @@ impl Supervised {
         command.arg0(program.with_file_name("adaptive-bridge"));
         command.args(&self.arguments).env(SUPERVISOR_VARIABLE, std::process::id().to_string());
         command.env(FOLDER_VARIABLE, &self.folder);
-        // The service manager supervises this process only; without these the children send it no
-        // notifications.
-        for variable in ["NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"] {
+        // The service manager supervises this process only.
+        for variable in ["WATCHDOG_PID", "WATCHDOG_USEC"] {
             command.env_remove(variable);
         }
         command.stdin(Stdio::null()).stderr(Stdio::piped());
-        let mut process = with_hang_up_blocked(|| command.spawn())?;
+        let mut process = with_hang_up_blocked(|| socket_store::spawn(&mut command, self.sockets.as_ref()))?;
         if let Some(log) = process.stderr.take() {
             let name = self.name.clone();
             std::thread::spawn(move || forward_log(&name, log));
@@ -369,7 +384,12 @@ impl Supervised {
     /// Notices the end of the child, and restarts it when its backoff is over.
     fn poll(&mut self, now: MonotonicNs) {
         if self.state == State::Running {
-            match self.process.as_mut().map(Child::try_wait) {
+            let ended = self.process.as_mut().map(Child::try_wait);
+            // After the line above, so that a socket that the child stored just before its end is kept.
+            if let Some(sockets) = &mut self.sockets {
+                sockets.receive();
+            }
+            match ended {
                 Some(Ok(Some(status))) => {
                     self.process = None;
                     let exit = exit_of(status);
@@ -438,6 +458,12 @@ impl Supervised {
                 State::GaveUp
             }
         };
+        // Its peers know of an orderly end, and without a restart nobody would read the sockets.
+        if let Some(sockets) = &mut self.sockets
+            && (exit == ChildExit::Code(0) || self.state == State::GaveUp)
+        {
+            sockets.close();
+        }
     }
 
     /// Sends the signals. A child in SIGSTOP handles them when it is continued; SIGKILL ends it at once.

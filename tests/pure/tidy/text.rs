@@ -22,6 +22,8 @@ const UNSAFE: &[&str] = &[
     "src/shm/service.rs",
     "src/shm/subscriber.rs",
     "src/shm/wake.rs",
+    // File descriptors that come from another process.
+    "src/process/kept_sockets.rs",
     // System calls without a safe wrapper.
     "src/process/allocator.rs",
     "src/process/scheduling.rs",
