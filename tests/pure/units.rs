@@ -75,3 +75,12 @@ fn only_ingress_and_the_critical_lane_may_use_real_time_scheduling_and_lock_memo
         }
     }
 }
+
+#[test]
+fn systemd_keeps_the_sockets_of_ingress_and_the_critical_lane() {
+    // systemd ignores the sockets of a process whose notifications it does not accept.
+    assert!(settings(COMMON).contains("NotifyAccess=main"));
+    let keeps = |unit: &str| settings(unit).contains("FileDescriptorStoreMax=8");
+    assert!(CRITICAL.into_iter().all(keeps));
+    assert!(!OTHERS.into_iter().any(keeps));
+}
