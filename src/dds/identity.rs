@@ -1,8 +1,10 @@
 //! What a participant and its writers take over from those of a killed process.
 
+use std::net::UdpSocket;
+
 use bytes::Bytes;
 
-use super::rustdds::{self, ContinuedSample, ContinuedWriter, GUID};
+use super::rustdds::{self, ContinuedSample, ContinuedWriter, DomainParticipantBuilder, GUID};
 use super::writer::{encoding, timestamp};
 use crate::model::{Encapsulation, Guid, SourceTimestamp};
 
@@ -13,6 +15,8 @@ pub struct ParticipantIdentity {
     pub participant: Guid,
     /// Its participant id, which gives its ports (RTPS 2.5, clause 9.6.2.3).
     pub participant_id: u16,
+    /// The UDP port of its urgent topics; 0 without them.
+    pub urgent_port: u16,
     /// The highest count of any HEARTBEAT, ACKNACK or NACK_FRAG.
     pub highest_count: i32,
     /// The highest sequence number of any writer of the participant's own: of discovery and of the graph.
@@ -28,6 +32,7 @@ impl ParticipantIdentity {
         Self {
             participant: guid,
             participant_id: identity.participant_id,
+            urgent_port: identity.urgent_port,
             highest_count: identity.highest_count,
             highest_number: identity.highest_number.max(graph_number),
         }
@@ -37,8 +42,36 @@ impl ParticipantIdentity {
         rustdds::ParticipantIdentity {
             prefix: self.participant.prefix(),
             participant_id: self.participant_id,
+            urgent_port: self.urgent_port,
             highest_count: self.highest_count,
             highest_number: self.highest_number,
+        }
+    }
+}
+
+/// What a participant takes over from one of a killed process, and leaves to a later one.
+#[derive(Default)]
+pub struct Kept {
+    /// The identity, and the [discovery journal](super::Participant::discovery_journal), which is read as
+    /// what comes from the network. `None` for a participant that is another one to others.
+    pub former: Option<(ParticipantIdentity, Vec<u8>)>,
+    /// The sockets of the former participant, with what has arrived meanwhile. Another participant uses them
+    /// as well: on a port that is new to it, Fast DDS 2.9.0 with assertions aborts when it matches a reader.
+    pub sockets: Vec<UdpSocket>,
+}
+
+impl Kept {
+    pub(super) fn graph_number(&self) -> i64 {
+        self.former.as_ref().map_or(0, |(identity, _)| identity.highest_number)
+    }
+
+    pub(super) fn extend(self, builder: DomainParticipantBuilder) -> DomainParticipantBuilder {
+        let builder = builder.with_sockets(self.sockets);
+        match self.former {
+            Some((identity, journal)) => {
+                builder.continuing(identity.to_rustdds()).with_discovery_journal(journal)
+            }
+            None => builder,
         }
     }
 }

@@ -23,7 +23,7 @@ pub use discovery::{Discovery, Endpoint};
 pub use error::DdsError;
 pub use graph::{GraphEntry, GraphNode, decode_graph, encode_graph};
 pub use graph_watch::{GraphRefusals, GraphWatch, MAX_GRAPH_ENDPOINTS, MAX_PARTICIPANTS};
-pub use identity::{FormerSample, ParticipantIdentity, WriterContinuation};
+pub use identity::{FormerSample, Kept, ParticipantIdentity, WriterContinuation};
 pub use memory::{DISCOVERY_BYTES, SOCKETS_BYTES, WITHHELD_BYTES, history_bytes};
 pub use network::{host_addresses, interfaces};
 pub use participant::{Participant, ParticipantOptions};

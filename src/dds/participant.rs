@@ -1,5 +1,7 @@
 //! A DDS participant that appears as one ROS 2 node.
 
+use std::io;
+use std::net::UdpSocket;
 use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
@@ -15,7 +17,7 @@ use super::discovery::{Discovery, translate};
 use super::error::DdsError;
 use super::graph;
 use super::graph_watch::{GraphWatch, MAX_PARTICIPANTS};
-use super::identity::{ParticipantIdentity, WriterContinuation};
+use super::identity::{Kept, ParticipantIdentity, WriterContinuation};
 use super::network;
 use super::qos::{self, ReaderQos};
 use super::reader::RawReader;
@@ -109,27 +111,20 @@ impl Participant {
         Self::build(options, 0, |builder| builder)
     }
 
-    /// Like [`open`](Self::open), as the participant of a killed process with that identity: others take both
-    /// for the same one. `journal` is the [`discovery_journal`](Self::discovery_journal) of the other
-    /// process, which is read as what comes from the network.
+    /// Like [`open`](Self::open), as a participant that a later process may continue, and that may itself
+    /// continue one of a killed process: others take both for the same one.
     ///
     /// # Errors
     /// As for [`open`](Self::open); a port of the identity is taken, or the journal is not sound as a whole.
-    pub fn open_continuing(
-        options: &ParticipantOptions,
-        identity: ParticipantIdentity,
-        journal: Vec<u8>,
-    ) -> Result<Self, DdsError> {
-        Self::build(options, identity.highest_number, |builder| {
-            builder.continuing(identity.to_rustdds()).with_discovery_journal(journal)
-        })
+    pub fn open_kept(options: &ParticipantOptions, kept: Kept) -> Result<Self, DdsError> {
+        Self::build(options, kept.graph_number(), |builder| kept.extend(builder))
     }
 
-    /// Like [`open`](Self::open), but the thread that receives calls `on_received` after each datagram,
-    /// before it acknowledges it, and after [`ring`](Self::ring). Taking a sample there saves the wake-up of
-    /// another thread. Some microseconds earlier, for a datagram with a sample or a fragment of one, the
-    /// thread calls `on_arriving` with the writer's GUID, the sequence number, and the bytes of the sample
-    /// that are still missing after this datagram, as the datagram claims.
+    /// Like [`open_kept`](Self::open_kept), but the thread that receives calls `on_received` after each
+    /// datagram, before it acknowledges it, and after [`ring`](Self::ring). Taking a sample there saves the
+    /// wake-up of another thread. Some microseconds earlier, for a datagram with a sample or a fragment of
+    /// one, the thread calls `on_arriving` with the writer's GUID, the sequence number, and the bytes of the
+    /// sample that are still missing after this datagram, as the datagram claims.
     ///
     /// Readers of `urgent_topics`, which are DDS topic names, get a UDP port of their own. What arrives there
     /// is received before what waits on other ports. Unfinished samples of all readers together take at most
@@ -139,16 +134,24 @@ impl Participant {
     /// not panic, and may take from readers and arm them, but not call the participant. `on_received` returns
     /// true if it has left work undone; it is then called again soon.
     ///
+    /// A participant that continues another one receives no samples until
+    /// [`receive_samples`](Self::receive_samples): they wait in the sockets, because a sample is discarded if
+    /// there is no reader that is matched with its writer.
+    ///
     /// # Errors
-    /// As for [`open`](Self::open).
+    /// As for [`open_kept`](Self::open_kept).
     pub fn open_receiving(
         options: &ParticipantOptions,
+        kept: Kept,
         max_unfinished_bytes: usize,
         urgent_topics: impl IntoIterator<Item = String>,
         on_arriving: impl FnMut([u8; 16], i64, usize) + Send + 'static,
         on_received: impl FnMut() -> bool + Send + 'static,
     ) -> Result<Self, DdsError> {
-        Self::build(options, 0, |builder| {
+        let holds = kept.former.is_some();
+        Self::build(options, kept.graph_number(), |builder| {
+            let builder = kept.extend(builder);
+            let builder = if holds { builder.holding_user_traffic() } else { builder };
             let builder = builder.with_max_unfinished_bytes(max_unfinished_bytes);
             let builder = builder.with_urgent_topics(urgent_topics);
             builder.on_sample_arriving(on_arriving).on_received(on_received)
@@ -225,15 +228,30 @@ impl Participant {
         Guid(self.participant.guid().to_bytes())
     }
 
-    /// What a later process needs to [continue](Self::open_continuing) the participant; `None` if that cannot
-    /// be done, because a port is not the one that goes with the participant id.
+    /// What a later process needs to [continue](Self::open_kept) the participant; `None` if that cannot be
+    /// done, because a port is not the one that goes with the participant id.
     pub fn identity(&self) -> Option<ParticipantIdentity> {
         let graph_number = self.graph_number.load(Ordering::Relaxed);
         let identity = self.participant.identity()?;
         Some(ParticipantIdentity::from_rustdds(identity, graph_number, self.guid()))
     }
 
-    /// What discovery knows of other participants and of their readers of this one's topics.
+    /// Duplicates of its sockets, for a later process, in which what arrives waits until then. Once.
+    ///
+    /// # Errors
+    /// The process has no file descriptor left, the participant is not one to be continued, or this was
+    /// called before.
+    pub fn sockets(&self) -> io::Result<Vec<UdpSocket>> {
+        self.participant.sockets()
+    }
+
+    /// Receives the samples that wait in the sockets of a participant of
+    /// [`open_receiving`](Self::open_receiving) that continues another one, and later ones.
+    pub fn receive_samples(&self) {
+        self.participant.receive_user_traffic();
+    }
+
+    /// What discovery knows of other participants and of their endpoints of this one's topics.
     pub fn discovery_journal(&self) -> Vec<u8> {
         self.participant.discovery_journal()
     }
@@ -312,13 +330,18 @@ impl Participant {
         dds_type: impl Into<DdsType<'t>>,
         reader_qos: &ReaderQos,
     ) -> Result<RawReader, DdsError> {
-        let reader = self.make_reader(topic, dds_type.into(), reader_qos, DomainParticipant::begin_now)?;
+        let begin = DomainParticipant::begin_now;
+        let reader = self.make_reader(topic, dds_type.into(), reader_qos, None, begin)?;
         Ok(self.add_to_graph(reader))
     }
 
     /// Like [`create_reader`](Self::create_reader), for a RELIABLE reader that continues after an earlier
     /// one, of this process or of another. For each writer in `taken` it neither requests nor returns samples
     /// up to and including that sequence number. It returns every sample that arrives after its creation.
+    ///
+    /// `key` is a part of its entity id, which no other reader of the participant has; it begins with a byte
+    /// from 0x80 to 0xfe. A reader that has that of the former participant's reader is the same one to
+    /// others.
     ///
     /// # Errors
     /// The DDS library cannot create it.
@@ -327,31 +350,38 @@ impl Participant {
         topic: &str,
         dds_type: DdsType<'_>,
         reader_qos: &ReaderQos,
+        key: [u8; 3],
         taken: impl IntoIterator<Item = (Guid, i64)>,
     ) -> Result<RawReader, DdsError> {
         // The library adds 1 to the number.
         let last_taken = |number: i64| SequenceNumber::from(number.min(i64::MAX - 1));
         let taken =
             taken.into_iter().map(|(writer, number)| (GUID::from_bytes(writer.0), last_taken(number)));
-        let reader = self.make_reader(topic, dds_type, reader_qos, |participant, topic| {
+        let reader = self.make_reader(topic, dds_type, reader_qos, Some(key), |participant, topic| {
             participant.begin_after(topic, taken)
         })?;
         Ok(self.add_to_graph(reader))
     }
 
-    /// Like [`create_reader`](Self::create_reader), for a BEST_EFFORT reader beside a RELIABLE one of the
-    /// same topic: it [ignores](RawReader::ignore_reliable_writers) RELIABLE writers from its creation on.
+    /// Like [`create_reader`](Self::create_reader), for a BEST_EFFORT reader. It is beside a RELIABLE one of
+    /// the same topic if `beside_reliable`: it [ignores](RawReader::ignore_reliable_writers) RELIABLE writers
+    /// from its creation on. `key` is as for [`create_reader_after`](Self::create_reader_after).
     ///
     /// # Errors
     /// The DDS library cannot create it.
-    pub fn create_reader_beside_reliable(
+    pub fn create_best_effort_reader(
         &mut self,
         topic: &str,
         dds_type: DdsType<'_>,
         reader_qos: &ReaderQos,
+        key: [u8; 3],
+        beside_reliable: bool,
     ) -> Result<RawReader, DdsError> {
-        let reader = self.make_reader(topic, dds_type, reader_qos, DomainParticipant::begin_now)?;
-        reader.ignore_reliable_writers();
+        let begin = DomainParticipant::begin_now;
+        let reader = self.make_reader(topic, dds_type, reader_qos, Some(key), begin)?;
+        if beside_reliable {
+            reader.ignore_reliable_writers();
+        }
         Ok(self.add_to_graph(reader))
     }
 
@@ -367,7 +397,7 @@ impl Participant {
     /// # Errors
     /// The DDS library cannot create the reader.
     pub fn watch_graph(&self) -> Result<GraphWatch, DdsError> {
-        let reader = self.make_reader(graph::TOPIC, graph::TYPE, &GRAPH_READER_QOS, |_, _| Ok(()))?;
+        let reader = self.make_reader(graph::TOPIC, graph::TYPE, &GRAPH_READER_QOS, None, |_, _| Ok(()))?;
         reader.expect_small_samples();
         Ok(GraphWatch::new(reader))
     }
@@ -379,12 +409,19 @@ impl Participant {
         topic: &str,
         dds_type: DdsType<'_>,
         reader_qos: &ReaderQos,
+        key: Option<[u8; 3]>,
         begin: impl FnOnce(&DomainParticipant, &Topic) -> CreateResult<()>,
     ) -> Result<RawReader, DdsError> {
         let policies = qos::of_reader(reader_qos).with_user_data(qos::user_data(dds_type.hash));
         let made_topic = make_topic(&self.participant, topic, dds_type, &policies)?;
+        let create = || match key {
+            Some(key) => {
+                self.subscriber.create_simple_datareader_raw_continuing(&made_topic, Some(policies), key)
+            }
+            None => self.subscriber.create_simple_datareader_raw(&made_topic, Some(policies)),
+        };
         let inner = begin(&self.participant, &made_topic)
-            .and_then(|()| self.subscriber.create_simple_datareader_raw(&made_topic, Some(policies)))
+            .and_then(|()| create())
             .map_err(|error| DdsError::library(format!("a reader of {topic}"), error))?;
         let guid = Guid(inner.guid().to_bytes());
         Ok(RawReader { inner, guid })

@@ -11,7 +11,7 @@ const XML: i16 = 1;
 const XCDR2: i16 = 2;
 
 /// The QoS that a reader requests.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct ReaderQos {
     /// The requested RELIABILITY.
     pub reliability: Reliability,

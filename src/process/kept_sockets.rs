@@ -51,7 +51,6 @@ const MAX_ATTACHED: usize = 256;
 
 /// The UDP sockets that the supervisor passes to this process; none at a second call. To be called before
 /// the process opens sockets.
-#[cfg_attr(not(test), expect(dead_code, reason = "used by the next commit"))]
 pub(super) fn inherited() -> Vec<UdpSocket> {
     static TAKEN: AtomicBool = AtomicBool::new(false);
     if TAKEN.swap(true, Ordering::Relaxed) {
@@ -72,14 +71,12 @@ pub(super) fn inherited() -> Vec<UdpSocket> {
 ///
 /// # Errors
 /// The supervisor cannot be reached, or does not read its messages for [`SEND_TIMEOUT`].
-#[cfg_attr(not(test), expect(dead_code, reason = "used by the next commit"))]
 pub(super) fn store(sockets: &[UdpSocket]) -> io::Result<()> {
     let fds: Vec<RawFd> = sockets.iter().map(AsRawFd::as_raw_fd).collect();
     if fds.is_empty() { Ok(()) } else { send_to_supervisor(STORE, &fds) }
 }
 
 /// Makes the supervisor close the sockets that it keeps for this process.
-#[cfg_attr(not(test), expect(dead_code, reason = "used by the next commit"))]
 pub(super) fn forget() {
     if let Err(error) = send_to_supervisor(FORGET, &[]) {
         warn!(%error, "the supervisor may keep sockets that are no longer used");
@@ -182,8 +179,8 @@ fn inherit(fd: RawFd) -> io::Result<UdpSocket> {
         return Err(invalid("not inherited".to_owned()));
     }
     set_close_on_exec(borrowed, true)?;
-    // SAFETY: nothing else owns it. It is inherited: the standard library and socket2, with which this process
-    // opens sockets, set FD_CLOEXEC on each. It was not taken over before: the line above sets it, too.
+    // SAFETY: nothing else owns it. It is inherited: the standard library and socket2, with which this
+    // process opens sockets, set FD_CLOEXEC on each. It was not taken over before: that sets it, too.
     Ok(unsafe { OwnedFd::from_raw_fd(fd) }.into())
 }
 

@@ -9,6 +9,7 @@ mod allocator;
 mod control;
 mod count_log;
 mod egress;
+mod identity;
 mod in_force;
 mod ingress;
 mod kept_sockets;

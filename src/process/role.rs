@@ -112,49 +112,23 @@ impl Role {
     /// that process's participant, so that the others remove it.
     pub fn join(&mut self, options: &ParticipantOptions) -> Result<Participant, RoleError> {
         let participant = Participant::open(options)?;
-        self.adopt(&participant);
-        Ok(participant)
-    }
-
-    /// Like [`join`](Self::join), of a participant that is open. It may be the one of the former process,
-    /// which is not disposed of then.
-    pub fn adopt(&mut self, participant: &Participant) {
-        if participant.guid() != self.former.participant {
-            self.dispose_former(participant);
-        }
-        self.record_participant(participant);
-    }
-
-    /// Like [`join`](Self::join), with callbacks for the receiving thread; see
-    /// [`Participant::open_receiving`]. Leaves the participant of the former process to a later call of
-    /// [`dispose_former`](Self::dispose_former).
-    pub fn join_receiving(
-        &mut self,
-        options: &ParticipantOptions,
-        max_unfinished_bytes: usize,
-        urgent_topics: impl IntoIterator<Item = String>,
-        on_arriving: impl FnMut([u8; 16], i64, usize) + Send + 'static,
-        on_received: impl FnMut() -> bool + Send + 'static,
-    ) -> Result<Participant, RoleError> {
-        let participant = Participant::open_receiving(
-            options,
-            max_unfinished_bytes,
-            urgent_topics,
-            on_arriving,
-            on_received,
-        )?;
         self.record_participant(&participant);
+        self.dispose_former(&participant);
         Ok(participant)
     }
 
-    /// Announces to the other participants, once, that the participant of a killed former process is gone. A
-    /// writer then releases the samples that only the former process had not acknowledged.
+    /// Announces to the other participants, once, that the participant of a killed former process is gone,
+    /// unless this process continues it. A writer then releases the samples that only the former process had
+    /// not acknowledged.
     pub fn dispose_former(&mut self, participant: &Participant) {
-        participant.dispose_participant(std::mem::take(&mut self.former.participant));
+        let former = std::mem::take(&mut self.former.participant);
+        if former != participant.guid() {
+            participant.dispose_participant(former);
+        }
     }
 
     /// Writes the participant to the health board, for a successor that has to dispose of it.
-    fn record_participant(&mut self, participant: &Participant) {
+    pub fn record_participant(&mut self, participant: &Participant) {
         let guid = participant.guid();
         self.health.update(|health| health.participant = guid);
     }

@@ -21,10 +21,11 @@ use super::send_log::SendLog;
 use super::wake::{LaneSleeper, LaneWaker};
 use crate::config::Settings;
 use crate::model::{
-    AbsenceRecord, ControlRecord, IngressCounters, InstanceName, IntruderRecord, LaneCounters, LaneIdentity,
-    LaneName, LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MAX_PUBLISHERS,
-    MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, PartialSample, PatternRecord, ProcessHealth,
-    PublisherAccount, RouteId, RouteInfo, SubscriberRecord, WriterIdentity, fnv1a,
+    AbsenceRecord, ControlRecord, EndpointIdentity, IngressCounters, InstanceName, IntruderRecord,
+    LaneCounters, LaneName, LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS,
+    MAX_PUBLISHERS, MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, PartialSample, PatternRecord,
+    ProcessHealth, ProcessIdentity, PublisherAccount, Reliability, RouteId, RouteInfo, SubscriberRecord,
+    fnv1a,
 };
 
 /// The lanes and routes for which the boards have room. It must be the same in all processes of an instance.
@@ -78,7 +79,9 @@ pub enum Stage {
 }
 
 /// Incremented whenever the meaning of a word in the segment changes.
-const LAYOUT_VERSION: u32 = 12;
+const LAYOUT_VERSION: u32 = 13;
+/// The readers of a route: one for the publishers of each reliability.
+const READERS: usize = 2;
 /// "ABboards": the first word, by which a file of another program is rejected.
 const MAGIC: u64 = 0x4142_626f_6172_6473;
 const HISTOGRAM_WORDS: usize = size_of::<LatencyHistogram>() / 8;
@@ -103,7 +106,8 @@ struct Layout {
     publisher: usize,
     lane: usize,
     output_readers: usize,
-    lane_identity: usize,
+    identity: usize,
+    reader_identity: usize,
     writer_identity: usize,
     send_log: usize,
     histograms: usize,
@@ -137,8 +141,9 @@ impl Layout {
             publisher: next(routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS),
             lane: next(lanes * routes * Cell::<LaneCounters>::WORDS),
             output_readers: next(lanes * routes * Cell::<OutputReaders>::WORDS),
-            lane_identity: next(lanes * Cell::<LaneIdentity>::WORDS),
-            writer_identity: next(lanes * routes * Cell::<WriterIdentity>::WORDS),
+            identity: next((2 + lanes) * Cell::<ProcessIdentity>::WORDS),
+            reader_identity: next(routes * READERS * Cell::<EndpointIdentity>::WORDS),
+            writer_identity: next(lanes * routes * Cell::<EndpointIdentity>::WORDS),
             send_log: next(lanes * routes * SendLog::WORDS),
             histograms: next(routes * (1 + 3 * lanes) * HISTOGRAM_WORDS.next_multiple_of(LINE)),
             words: end,
@@ -163,6 +168,14 @@ impl Layout {
 
     fn wake(&self, lane: usize) -> usize {
         self.wake + self.check_lane(lane) * LINE
+    }
+
+    fn process(&self, role: ProcessRole) -> usize {
+        match role {
+            ProcessRole::Ingress => 0,
+            ProcessRole::Control => 1,
+            ProcessRole::Egress(lane) => 2 + self.check_lane(lane),
+        }
     }
 
     fn output(&self, lane: usize, route: usize) -> usize {
@@ -220,11 +233,7 @@ macro_rules! boards {
 
 boards! {
     /// The health of a process.
-    health, health_writer(role: ProcessRole): ProcessHealth = |layout| match role {
-        ProcessRole::Ingress => 0,
-        ProcessRole::Control => 1,
-        ProcessRole::Egress(lane) => 2 + layout.check_lane(lane),
-    };
+    health, health_writer(role: ProcessRole): ProcessHealth = |layout| layout.process(role);
     /// The state and decisions of control that concern the whole bridge.
     control, control_writer(): ControlRecord = |layout| 0;
     /// The record of the subscriber at an index below [`MAX_SUBSCRIBERS`].
@@ -252,10 +261,13 @@ boards! {
     /// The readers that are matched with a lane's output of a route.
     output_readers, output_readers_writer(lane: usize, route: usize): OutputReaders =
         |layout| layout.output(lane, route);
-    /// The identity of the participant of a lane's process.
-    lane_identity, lane_identity_writer(lane: usize): LaneIdentity = |layout| layout.check_lane(lane);
+    /// The identity of the participant of a process.
+    identity, identity_writer(role: ProcessRole): ProcessIdentity = |layout| layout.process(role);
+    /// The identity of the DDS reader of a route for the publishers of a reliability.
+    reader_identity, reader_identity_writer(route: usize, reliability: Reliability): EndpointIdentity =
+        |layout| layout.check_route(route) * READERS + reliability as usize;
     /// The identity of the DDS writer of a lane's output of a route.
-    writer_identity, writer_identity_writer(lane: usize, route: usize): WriterIdentity =
+    writer_identity, writer_identity_writer(lane: usize, route: usize): EndpointIdentity =
         |layout| layout.output(lane, route);
 }
 
@@ -463,13 +475,15 @@ mod tests {
         let mut found = vec![
             place(layout.health(ProcessRole::Ingress)),
             place(layout.health(ProcessRole::Control)),
+            place(layout.identity(ProcessRole::Ingress)),
+            place(layout.identity(ProcessRole::Control)),
             place(layout.control()),
         ];
         for lane in 0..lanes {
             found.push((layout.wake(lane), LINE));
             found.push(place(layout.health(ProcessRole::Egress(lane))));
             found.push(place(layout.policy(lane)));
-            found.push(place(layout.lane_identity(lane)));
+            found.push(place(layout.identity(ProcessRole::Egress(lane))));
         }
         found.extend((0..MAX_SUBSCRIBERS).map(|index| place(layout.subscriber(index))));
         found.extend((0..MAX_INTRUDERS).map(|index| place(layout.intruder(index))));
@@ -480,6 +494,9 @@ mod tests {
             found.push(place(layout.pattern(route)));
             found.push(place(layout.partial(route)));
             found.push(place(layout.ingress(route)));
+            for reliability in [Reliability::BestEffort, Reliability::Reliable] {
+                found.push(place(layout.reader_identity(route, reliability)));
+            }
             found.extend((0..MAX_PUBLISHERS).map(|index| place(layout.publisher(route, index))));
             let mut stages = vec![Stage::DdsIn];
             for lane in 0..lanes {

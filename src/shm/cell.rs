@@ -11,10 +11,10 @@ use std::sync::atomic::{Ordering, fence};
 
 use super::segment::Segment;
 use crate::model::{
-    AbsenceRecord, ControlRecord, DropReason, IngressCounters, IntruderRecord, LaneCounters, LaneIdentity,
-    LanePolicy, LatencyHistogram, MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, NamedEndpoint, NetworkRefusal,
-    OutputReaders, PartialSample, PatternRecord, ProbeRefusal, ProcessHealth, PublisherAccount, RouteInfo,
-    SubscriberRecord, WriterIdentity,
+    AbsenceRecord, ControlRecord, DropReason, EndpointIdentity, IngressCounters, IntruderRecord,
+    LaneCounters, LanePolicy, LatencyHistogram, MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, NamedEndpoint,
+    NetworkRefusal, OutputReaders, PartialSample, PatternRecord, ProbeRefusal, ProcessHealth,
+    ProcessIdentity, PublisherAccount, RouteInfo, SubscriberRecord,
 };
 
 /// Words of a cache line. Every value begins on a new line, so that two writers never share a line.
@@ -66,8 +66,8 @@ plain! {
     IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 5 + 3 + 2,
     LaneCounters: 6 + DropReason::COUNT + 8,
     OutputReaders: MAX_OUTPUT_READERS * (6 + 2) + MAX_UNMATCHED_READERS * 3 + 2,
-    LaneIdentity: 8,
-    WriterIdentity: 3,
+    ProcessIdentity: 10,
+    EndpointIdentity: 3,
     LatencyHistogram: size_of::<LatencyHistogram>().div_ceil(8),
 }
 

@@ -1,4 +1,4 @@
-//! What a lane's process has discovered, in a file in shared memory, for the next process of the lane.
+//! What a process has discovered, in a file in shared memory, for the next process of its role.
 //!
 //! The file is replaced as a whole, so a killed process leaves the former one or the new one. A file with
 //! anything else in it is refused.
@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use super::node::ShmNode;
 use super::root::SHM_DIR;
-use crate::model::{Guid, LaneName, fnv1a};
+use crate::model::{Guid, fnv1a};
 
 /// The longest content. A longer one is not written: its reader would lack a part of it.
 const MAX_BYTES: usize = 256 << 10;
@@ -19,7 +19,7 @@ const MAGIC: [u8; 8] = *b"ABjourn1";
 /// Magic bytes, owner, checksum of owner and content.
 const HEADER_BYTES: usize = 8 + 16 + 8;
 
-/// The journal of a lane. One process at a time: the holder of the role's lock.
+/// The journal of a role. One process at a time: the holder of the role's lock.
 #[derive(Debug)]
 pub struct Journal {
     path: PathBuf,
@@ -28,9 +28,9 @@ pub struct Journal {
 }
 
 impl Journal {
-    /// The journal of a lane, which need not exist.
-    pub fn of(node: &ShmNode, lane: &LaneName) -> Self {
-        let name = format!("{}journal-{lane}", node.shared().dir().prefix);
+    /// The journal of a role, which need not exist.
+    pub fn of(node: &ShmNode, role: &str) -> Self {
+        let name = format!("{}journal-{role}", node.shared().dir().prefix);
         Self { path: Path::new(SHM_DIR).join(name), written: None }
     }
 

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use adaptive_bridge::config::DdsNetwork;
 use adaptive_bridge::dds::{
-    Arrival, ArrivalFlag, Discovery, LentMemory, Participant, ParticipantOptions, Payload, RawReader,
+    Arrival, ArrivalFlag, Discovery, Kept, LentMemory, Participant, ParticipantOptions, Payload, RawReader,
     RawWriter, ReaderEvent, ReaderQos, SampleMemory, Take, TakePayload, WriteError, WriterEvent,
 };
 use adaptive_bridge::model::{
@@ -122,9 +122,15 @@ fn a_sample_is_announced_before_it_is_received() {
         }
     };
     let network = DdsNetwork::of_domain(69);
-    let mut there =
-        Participant::open_receiving(&options("there", &network), usize::MAX, [], on_arriving, on_received)
-            .unwrap();
+    let mut there = Participant::open_receiving(
+        &options("there", &network),
+        Kept::default(),
+        usize::MAX,
+        [],
+        on_arriving,
+        on_received,
+    )
+    .unwrap();
     let mut here = participant("here", 69);
     let reader = there
         .create_reader("rt/blob", TYPE, &reader_qos(Reliability::Reliable, Durability::Volatile))
@@ -198,9 +204,15 @@ fn a_watch_of_arrivals_sees_samples_and_takes_none() {
     // Holds up the receiving thread, so that the watching thread peeks first.
     let hold = Arc::new(Mutex::new(()));
     let on_received = support::waits_for(&hold);
-    let mut there =
-        Participant::open_receiving(&options("there", &network), usize::MAX, [], |_, _, _| {}, on_received)
-            .unwrap();
+    let mut there = Participant::open_receiving(
+        &options("there", &network),
+        Kept::default(),
+        usize::MAX,
+        [],
+        |_, _, _| {},
+        on_received,
+    )
+    .unwrap();
     let mut here = participant("here", 66);
     // BEST_EFFORT: a RELIABLE reader would receive a sample again that the watching thread had taken.
     let reader = there

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
 
 use adaptive_bridge::config::DdsNetwork;
-use adaptive_bridge::dds::{Participant, ParticipantOptions, RawWriter, ReaderQos, WriterEvent};
+use adaptive_bridge::dds::{Kept, Participant, ParticipantOptions, RawWriter, ReaderQos, WriterEvent};
 use adaptive_bridge::model::{Durability, Encapsulation, Guid, QosProfile, Reliability, SourceTimestamp};
 use bytes::Bytes;
 use support::bed::{is_accounted_and_idle, outputs};
@@ -71,9 +71,15 @@ fn a_lane_sends_what_waits_on_the_route_of_the_higher_priority_first() {
     wait_matched(&bulk);
     wait_matched(&stop);
     let (on_arriving, order) = recorder();
-    let mut subscriber =
-        Participant::open_receiving(&options("subscriber", &network), usize::MAX, [], on_arriving, || false)
-            .unwrap();
+    let mut subscriber = Participant::open_receiving(
+        &options("subscriber", &network),
+        Kept::default(),
+        usize::MAX,
+        [],
+        on_arriving,
+        || false,
+    )
+    .unwrap();
     let mut reader = |lane: &str, route: &str, reliability| {
         let topic = format!("rt/adaptive_bridge/{lane}/{route}");
         subscriber.create_reader(&topic, TYPE, &qos(reliability)).unwrap()
@@ -136,6 +142,7 @@ fn ingress_receives_the_routes_of_higher_priorities_before_what_arrived_earlier(
     let urgent = ["rt/stop".to_owned()];
     let mut there = Participant::open_receiving(
         &options("there", &network),
+        Kept::default(),
         usize::MAX,
         urgent,
         on_arriving,

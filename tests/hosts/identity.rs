@@ -11,17 +11,6 @@ use support::process::signal;
 const KILLS: usize = 5;
 const RATE_HZ: f64 = 200.0;
 
-/// How often a writer has been matched by the subscriber, and unmatched.
-fn matches(subscriber: &RunningPeer) -> (usize, usize) {
-    let events = subscriber.events();
-    let changes = events.iter().filter(|event| event["event"] == "matched");
-    let changes: Vec<i64> = changes.filter_map(|event| event["change"].as_i64()).collect();
-    (
-        changes.iter().filter(|change| **change > 0).count(),
-        changes.iter().filter(|change| **change < 0).count(),
-    )
-}
-
 /// What a subscriber saw.
 struct Seen {
     name: &'static str,
@@ -56,7 +45,7 @@ fn kill(bed: &Bed, pause: Duration) -> Vec<Seen> {
     sent.assert_not_blocked();
     bed.wait_accounted();
     let seen = subscribers.map(|(name, subscriber)| {
-        let matches = matches(&subscriber);
+        let matches = subscriber.matches();
         Seen { name, matches, received: subscriber.end() }
     });
     for Seen { name, matches, received } in &seen {
@@ -114,7 +103,7 @@ fn subscribers_may_come_and_go_while_no_lane_runs() {
     });
     let _: Sent = publisher.end();
     for subscriber in stays.into_iter().chain(comes) {
-        assert_eq!(matches(&subscriber), (1, 0));
+        assert_eq!(subscriber.matches(), (1, 0));
         subscriber.end::<Received>().assert_sound();
     }
     bed.end();

@@ -179,6 +179,13 @@ fn a_killed_or_stopped_unit_is_restarted_and_delays_no_other() {
             let active = began.elapsed();
             flow.wait_critical(20);
             let critical = began.elapsed();
+            // Those of discovery and of samples, by unicast and by multicast.
+            let sockets = if [INGRESS, EGRESS_CRITICAL].contains(&unit) { "4" } else { "0" };
+            assert_eq!(bed.machine.property(unit, "NFileDescriptorStore"), sockets, "{unit}");
+            if (unit, signal) == (INGRESS, "KILL") {
+                let status = bed.machine.try_status().unwrap();
+                assert_eq!(status["routes"][0]["lost_upstream"], 0, "{status}");
+            }
             // Later than the other: the supervisor of safety suspends this lane while the critical one has
             // trouble, and for ten good readings after that, two a second.
             flow.wait_slow(3);

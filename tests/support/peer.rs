@@ -409,6 +409,14 @@ impl RunningPeer {
         last.and_then(|event| event["current"].as_u64()).unwrap_or(0)
     }
 
+    /// How often an endpoint has been matched, and unmatched.
+    pub fn matches(&self) -> (usize, usize) {
+        let events = self.events().into_iter().filter(|event| event["event"] == "matched");
+        let changes: Vec<i64> = events.filter_map(|event| event["change"].as_i64()).collect();
+        let count = |is_one: fn(&i64) -> bool| changes.iter().filter(|change| is_one(change)).count();
+        (count(|change| *change > 0), count(|change| *change < 0))
+    }
+
     /// Waits until so many endpoints match the peer's.
     pub fn wait_matched(&self, endpoints: u64) {
         super::wait_until(format!("{endpoints} matched endpoints"), || self.matched() == endpoints);

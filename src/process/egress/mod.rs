@@ -12,7 +12,6 @@ mod former_readers;
 mod former_samples;
 mod gaps;
 mod history;
-mod identity;
 mod late_joiners;
 pub(super) mod memory;
 mod noncritical;
@@ -20,27 +19,29 @@ mod offer;
 mod output;
 mod overrun;
 mod unsent;
+mod writer_record;
 
 use std::time::Duration;
 
 use tracing::{info, warn};
 
 use super::HOUSEKEEPING_MS;
+use super::identity::Identity;
 use super::memory_limit;
 use super::notify::{Meter, Notifier, write_drops, write_list};
 use super::reload::ReloadRequests;
 use super::role::{Role, RoleError, lane_index, participant_options};
 use super::stop::Stop;
 use crate::clock;
-use crate::config::{self, Configuration, Forwarding, Settings};
+use crate::config::{self, Configuration, Forwarding, Lane, Settings};
 use crate::dds::{Discovery, Participant, ParticipantOptions};
 use crate::model::{Guid, LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
 use crate::policy::mode_and_source;
 use crate::shm::{Boards, LaneSleeper, ProcessRole};
 use arena::CopyArena;
-use identity::Identity;
 use noncritical::Noncritical;
 use output::Output;
+use writer_record::may_be_kept;
 
 /// Samples that a critical lane takes from one route before it serves the next one, and the samples of higher
 /// priorities that it sends meanwhile. Both are limited, so that each route has its turn.
@@ -108,6 +109,28 @@ pub fn end_unused(name: &str) {
     Notifier::new().ready();
 }
 
+/// Opens the participant of a lane: that of the former process if the lane is critical and others can't tell
+/// the two apart.
+fn join(
+    role: &mut Role,
+    lane: &Lane,
+    process: ProcessRole,
+    role_name: &str,
+    options: &ParticipantOptions,
+) -> Result<(Participant, Option<Identity>), RoleError> {
+    if lane.class() != TrafficClass::Critical {
+        return Ok((role.join(options)?, None));
+    }
+    let may_be_continued = may_be_kept(role, lane);
+    let open = |kept| Participant::open_kept(options, kept);
+    let (participant, identity, continued) =
+        Identity::join(role, process, role_name, may_be_continued, options, open)?;
+    if !continued {
+        role.dispose_former(&participant);
+    }
+    Ok((participant, Some(identity)))
+}
+
 struct Egress {
     index: usize,
     /// Those of the highest priority first. Declared before the participant, because the DDS library requires
@@ -142,7 +165,7 @@ impl Egress {
         let node = format!("egress_{}", lane.name);
         let options =
             ParticipantOptions { dscp: lane.dscp, ..participant_options(settings, &lane.network, &node) };
-        let (mut participant, identity) = Identity::join(&mut role, settings, index, &options)?;
+        let (mut participant, identity) = join(&mut role, lane, process, &role_name, &options)?;
         let mut outputs = Vec::with_capacity(lane.outputs.len());
         let mut more_urgent = Vec::with_capacity(lane.outputs.len());
         let priority = |output: &config::Output| settings.routes[output.route].priority;

@@ -10,6 +10,7 @@ use super::super::role::{Role, RoleError};
 use super::arrival_progress::ArrivalProgress;
 use super::pool::{Filled, PoolOwner};
 use super::publishers::{Publishers, SequenceCheck};
+use super::reader_record::ReaderRecord;
 use super::source::{ReaderPlan, Source, label};
 use crate::clock;
 use crate::config::{Lane, Route, Settings};
@@ -48,6 +49,7 @@ pub(super) struct Input {
     inbox: Inbox,
     /// The reader of the publishers of each reliability, or of all where the configuration sets one.
     readers: BTreeMap<Reliability, ActiveReader>,
+    records: [ReaderRecord; 2],
     /// The type of the first reader. It never changes, because the lanes have writers of it.
     settled_type: Option<String>,
     /// Whether the publishers have changed since `connect` last chose the readers.
@@ -99,6 +101,8 @@ impl Input {
             source: Source::default(),
             inbox: Inbox::with_flag(Arc::clone(flag)),
             readers: BTreeMap::new(),
+            records: [Reliability::BestEffort, Reliability::Reliable]
+                .map(|reliability| ReaderRecord::of(role, index, reliability)),
             settled_type: None,
             source_changed: true,
             pool: PoolOwner::new(
@@ -455,19 +459,20 @@ impl Input {
         let topic = self.dds_topic.as_str();
         let (hash, has_keys) = (self.info.get().type_hash, self.info.get().has_keys != 0);
         let announced_type = DdsType { name: dds_type, hash, has_keys };
+        let record = &mut self.records[qos.reliability as usize];
+        let key = record.next(participant.guid(), topic, &announced_type, &qos);
         let reader = match qos.reliability {
             Reliability::Reliable => participant.create_reader_after(
                 topic,
                 announced_type,
                 &qos,
+                key,
                 self.publishers.last_sequences(),
             )?,
             // A BEST_EFFORT reader takes what arrives from now on; it cannot request earlier samples.
-            Reliability::BestEffort if !self.readers.contains_key(&Reliability::Reliable) => {
-                participant.create_reader(topic, announced_type, &qos)?
-            }
             Reliability::BestEffort => {
-                participant.create_reader_beside_reliable(topic, announced_type, &qos)?
+                let beside_reliable = self.readers.contains_key(&Reliability::Reliable);
+                participant.create_best_effort_reader(topic, announced_type, &qos, key, beside_reliable)?
             }
         };
         info!(
@@ -501,6 +506,7 @@ impl Input {
 
     fn remove_reader(&mut self, participant: &mut Participant, reliability: Reliability) {
         if let Some(former) = self.readers.remove(&reliability) {
+            self.records[reliability as usize].removed();
             drop(self.inbox.remove(former.guid));
             participant.remove_endpoint(former.guid);
             self.lend_memory();
@@ -513,6 +519,11 @@ impl Input {
         for reader in self.inbox.readers() {
             reader.lend_memory(self.pool.lender());
         }
+    }
+
+    /// Whether the readers are matched with as many publishers as wrote until the former process died.
+    pub fn is_matched_again(&self) -> bool {
+        self.matched_writers() >= self.publishers.expected()
     }
 
     /// The number of matched publishers. A RELIABLE one that the BEST_EFFORT reader matched before there was

@@ -11,6 +11,7 @@ pub(super) mod memory;
 mod patterns;
 mod pool;
 mod publishers;
+mod reader_record;
 mod receiving;
 mod source;
 
@@ -20,6 +21,7 @@ use std::time::Duration;
 use tracing::info;
 
 use super::HOUSEKEEPING_MS;
+use super::identity::Identity;
 use super::memory_limit;
 use super::notify::{Meter, write_drops, write_list};
 use super::reload::ReloadRequests;
@@ -52,6 +54,13 @@ const RESUME_MS: u64 = 1_000;
 /// names 256 samples, so the remaining ones may take two or three more requests.
 const RESUMED_MS: u64 = 200;
 
+/// How long at most a process that continues the participant of a killed one leaves samples in the sockets
+/// until its readers are matched again, which takes some 10 ms with the journal of discovery. A BEST_EFFORT
+/// sample that does not fit the socket's buffer is lost: with the default `net.core.rmem_max`, the 97th scan.
+const HOLD_MS: u64 = 100;
+/// How often it checks that.
+const HOLD_POLL_MS: u64 = 2;
+
 /// Runs ingress until `stop` is requested. No reloadable setting concerns ingress.
 ///
 /// # Errors
@@ -66,6 +75,7 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
         }
     }
     ingress.role.notifier.stopping();
+    ingress.identity.end();
     // Publishes the samples that DDS has received by now. The time limit is for publishers that keep sending.
     let give_up_at = clock::monotonic().plus_ms(LAST_SAMPLES_MS);
     while ingress.receiving.turn(false) && clock::monotonic() < give_up_at {}
@@ -78,8 +88,11 @@ struct Ingress {
     _early_waker: Option<EarlyWaker>,
     receiving: Arc<Receiving>,
     participant: Participant,
+    identity: Identity,
     role: Role,
     patterns: Patterns,
+    /// Until when samples are left in the sockets at most; `None` once they are received.
+    hold_until: Option<MonotonicNs>,
     /// Whether each publisher that wrote until the former process died has sent a sample to this process.
     has_resumed: bool,
     /// The latest time to dispose of the participant of a killed former process.
@@ -120,17 +133,22 @@ impl Ingress {
         }
         let urgent: Vec<_> = urgent_routes(settings).collect();
         let receiving = Arc::new(Receiving::new(inputs, lanes, !urgent.is_empty()));
-        let (on_arriving, on_received) = receiving.hooks();
         let options = participant_options(settings, &settings.input, "ingress");
-        let urgent_topics =
-            urgent.into_iter().filter_map(|route| match &settings.routes[route].input_topic {
+        let urgent_topics = || {
+            urgent.iter().filter_map(|route| match &settings.routes[*route].input_topic {
                 InputTopic::Topic(topic) => Some(topic.to_dds()),
                 InputTopic::Pattern(_) => None,
-            });
+            })
+        };
         let unfinished = pool::UNFINISHED_IN_ALL_BYTES;
-        let participant =
-            role.join_receiving(&options, unfinished, urgent_topics, on_arriving, on_received)?;
+        let open = |kept| {
+            let (on_arriving, on_received) = receiving.hooks();
+            Participant::open_receiving(&options, kept, unfinished, urgent_topics(), on_arriving, on_received)
+        };
+        let (participant, identity, continued) =
+            Identity::join(&mut role, ProcessRole::Ingress, "ingress", true, &options, open)?;
         let resume_until = clock::monotonic().plus_ms(RESUME_MS);
+        let hold_until = continued.then(|| clock::monotonic().plus_ms(HOLD_MS));
         let patterns = Patterns::open(settings, &role.boards);
         let early_waker = EarlyWaker::start(&participant, &receiving, settings);
         let housekeeping_at = clock::monotonic();
@@ -138,8 +156,10 @@ impl Ingress {
             _early_waker: early_waker,
             receiving,
             participant,
+            identity,
             role,
             patterns,
+            hold_until,
             has_resumed: false,
             resume_until,
             housekeeping_at,
@@ -166,7 +186,9 @@ impl Ingress {
     }
 
     fn housekeeping(&mut self, now: MonotonicNs) -> Result<(), RoleError> {
+        let mut discovery_changed = false;
         while let Some(change) = self.participant.poll_discovery() {
+            discovery_changed = true;
             match change {
                 Discovery::Writer(writer) if !self.participant.owns(writer.guid) => {
                     self.patterns.writer_found(&writer);
@@ -186,14 +208,20 @@ impl Ingress {
         self.bind_places(now);
         // A topic of a pattern may appear at any time.
         let mut searching = !self.patterns.places().is_empty();
-        let mut resumed = true;
+        let (mut resumed, mut matched) = (true, true);
         let mut outcome = Ok(());
         self.for_each_input(|input, participant| {
             let done = input.housekeeping(participant, now);
             outcome = std::mem::replace(&mut outcome, Ok(())).and(done);
             searching |= !input.is_connected() && !input.route.input_topic.is_place();
-            resumed &= input.publishers.have_resumed();
+            resumed &= input.publishers.expected() == 0;
+            matched &= input.is_matched_again();
         });
+        if self.hold_until.is_some_and(|hold_until| matched || now >= hold_until) {
+            self.hold_until = None;
+            self.participant.receive_samples();
+        }
+        self.identity.housekeeping(&self.participant, discovery_changed, true, now);
         // Not earlier: a publisher releases samples that every matched reader has acknowledged, and the
         // readers of this process have not requested them yet.
         if resumed && !std::mem::replace(&mut self.has_resumed, true) {
@@ -212,7 +240,8 @@ impl Ingress {
             self.role.report_turn(LaneMode::Normal as u8, 0, self.participant.network_refusals());
         }
         self.search_at = searching.then(|| now.plus_ms(SEARCHING_MS));
-        self.housekeeping_at = now.plus_ms(HOUSEKEEPING_MS);
+        let interval_ms = if self.hold_until.is_some() { HOLD_POLL_MS } else { HOUSEKEEPING_MS };
+        self.housekeeping_at = now.plus_ms(interval_ms);
         outcome
     }
 

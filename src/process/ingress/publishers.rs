@@ -168,10 +168,11 @@ impl Publishers {
         }
     }
 
-    /// Whether each publisher that wrote until the former process died has sent a sample to this process, or
-    /// is gone.
-    pub fn have_resumed(&self) -> bool {
-        !self.expected.iter().zip(self.gone).any(|(is_expected, is_gone)| *is_expected && !is_gone)
+    /// How many publishers that wrote until the former process died, and are not known to be gone, have sent
+    /// no sample to this process.
+    pub fn expected(&self) -> u64 {
+        let expected = self.expected.iter().zip(self.gone);
+        expected.filter(|(is_expected, is_gone)| **is_expected && !is_gone).count() as u64
     }
 
     /// Changes the counts of the route and the account at `place` atomically: a process that dies meanwhile
@@ -322,15 +323,15 @@ mod tests {
         drop(former);
 
         let mut successor = fixture.open(at(100));
-        assert!(!successor.1.have_resumed());
+        assert!(successor.1.expected() != 0);
         assert_eq!(successor.1.last_sequences().collect::<Vec<_>>(), [(ONE, 14), (TWO, 500)]);
         let marks = successor.1.marks();
         assert_eq!([ONE, TWO].map(|writer| marks.find(writer)), [Some((0, 14)), Some((1, 500))]);
         assert_eq!(take(&mut successor, ONE, 14, at(101)), None);
         assert_eq!(take(&mut successor, ONE, 20, at(101)), Some(5));
-        assert!(!successor.1.have_resumed());
+        assert!(successor.1.expected() != 0);
         successor.1.mark_gone(|known| known.prefix() == TWO.prefix(), true);
-        assert!(successor.1.have_resumed());
+        assert!(successor.1.expected() == 0);
         let account = fixture.boards.publisher(0, 0).unwrap();
         assert_eq!((account.first_sequence, account.last_sequence), (10, 20));
         assert_eq!((account.received, account.lost_upstream), (3, 8));
@@ -344,7 +345,7 @@ mod tests {
         assert_eq!(take(&mut former, ONE, 1, at(1)), Some(0));
         drop(former);
         for (now_ms, is_expected) in [(5_000, true), (5_001, false)] {
-            assert_eq!(fixture.open(at(now_ms)).1.have_resumed(), !is_expected, "{now_ms} ms");
+            assert_eq!(fixture.open(at(now_ms)).1.expected() == 0, !is_expected, "{now_ms} ms");
         }
     }
 

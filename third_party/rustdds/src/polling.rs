@@ -104,6 +104,10 @@ pub(crate) struct Hooks {
   pub max_unfinished_bytes: Option<usize>,
   /// See `DomainParticipantBuilder::continuing`.
   pub identity: Option<ParticipantIdentity>,
+  /// See `DomainParticipantBuilder::with_sockets`.
+  pub sockets: Option<Vec<std::net::UdpSocket>>,
+  /// See `DomainParticipantBuilder::holding_user_traffic`.
+  pub holds_user_traffic: bool,
   /// See `DomainParticipantBuilder::with_discovery_journal`.
   pub journal: Vec<u8>,
   /// Those of the participant.

@@ -1,34 +1,40 @@
-//! What a lane's process leaves to the next one, so that subscribers take both for the same.
+//! What a process leaves to the next one, so that other participants take both for the same.
 
 use super::hash::fnv1a;
 use super::sample::Guid;
+use super::time::MonotonicNs;
 
-/// The identity of the DDS participant of a lane's process, on a board.
+/// The identity of the DDS participant of a process, on a board.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
-pub struct LaneIdentity {
+pub struct ProcessIdentity {
     /// The participant; all zero if the next process cannot continue it.
     pub participant: Guid,
     /// Its participant id, which gives its ports (RTPS 2.5, clause 9.6.2.3).
     pub participant_id: u64,
+    /// The UDP port of its urgent topics; 0 without them.
+    pub urgent_port: u64,
     /// The counts of HEARTBEATs and ACKNACKs that the next process exceeds.
     pub highest_count: u64,
     /// The sequence numbers of built-in writers that the next process exceeds.
     pub highest_number: u64,
     /// A hash of what must be the same for the next process: domain, interfaces, addresses.
     pub conditions: u64,
-    /// 1 while the process that took it over has not run for long: the next one does not, in case that was
-    /// the reason why this one ended.
+    /// How many processes, up to this one, have taken it over and not run for long: after several the next
+    /// one does not, in case that is the reason why they ended.
     pub unproven: u64,
+    /// When the process wrote this.
+    pub alive_at: MonotonicNs,
     /// The `checksum` of the rest.
     pub checksum: u64,
 }
 
-/// The identity of the DDS writer of one output, on a board. Its highest sequence number is a word beside it.
+/// The identity of a DDS writer of a lane or a DDS reader of ingress, on a board. The highest sequence number
+/// of a writer is a word beside it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
-pub struct WriterIdentity {
-    /// How many writers the output has had under this participant, including this one; 0 for no writer.
+pub struct EndpointIdentity {
+    /// How many endpoints there have been in its place, including this one; 0 for none.
     pub count: u64,
     /// A hash of participant, topic, type and QoS.
     pub offer: u64,
@@ -63,25 +69,27 @@ macro_rules! checked {
     };
 }
 
-checked!(LaneIdentity: 7);
-checked!(WriterIdentity: 2);
+checked!(ProcessIdentity: 9);
+checked!(EndpointIdentity: 2);
 
-impl LaneIdentity {
-    fn words(&self) -> [u64; 7] {
+impl ProcessIdentity {
+    fn words(&self) -> [u64; 9] {
         let guid = u128::from_le_bytes(self.participant.0);
         [
             guid as u64,
             (guid >> 64) as u64,
             self.participant_id,
+            self.urgent_port,
             self.highest_count,
             self.highest_number,
             self.conditions,
             self.unproven,
+            self.alive_at.0,
         ]
     }
 }
 
-impl WriterIdentity {
+impl EndpointIdentity {
     const fn words(&self) -> [u64; 2] {
         [self.count, self.offer]
     }
@@ -93,29 +101,32 @@ mod tests {
 
     #[test]
     fn a_record_that_was_changed_or_never_written_is_not_intact() {
-        assert!(!LaneIdentity::default().is_intact());
-        assert!(!WriterIdentity::default().is_intact());
-        let lane = LaneIdentity { participant: Guid([7; 16]), participant_id: 3, ..LaneIdentity::default() };
-        let lane = lane.sealed();
-        assert!(lane.is_intact());
-        let changes: [fn(&mut LaneIdentity); 8] = [
-            |lane| lane.participant.0[0] ^= 1,
-            |lane| lane.participant.0[15] ^= 1,
-            |lane| lane.participant_id += 1,
-            |lane| lane.highest_count += 1,
-            |lane| lane.highest_number += 1,
-            |lane| lane.conditions += 1,
-            |lane| lane.unproven = 1,
-            |lane| lane.checksum ^= 1,
+        assert!(!ProcessIdentity::default().is_intact());
+        assert!(!EndpointIdentity::default().is_intact());
+        let process =
+            ProcessIdentity { participant: Guid([7; 16]), participant_id: 3, ..ProcessIdentity::default() };
+        let process = process.sealed();
+        assert!(process.is_intact());
+        let changes: [fn(&mut ProcessIdentity); 10] = [
+            |process| process.participant.0[0] ^= 1,
+            |process| process.participant.0[15] ^= 1,
+            |process| process.participant_id += 1,
+            |process| process.urgent_port += 1,
+            |process| process.highest_count += 1,
+            |process| process.highest_number += 1,
+            |process| process.conditions += 1,
+            |process| process.unproven = 1,
+            |process| process.alive_at = MonotonicNs(1),
+            |process| process.checksum ^= 1,
         ];
         for change in changes {
-            let mut changed = lane;
+            let mut changed = process;
             change(&mut changed);
             assert!(!changed.is_intact(), "{changed:?}");
         }
-        let writer = WriterIdentity { count: 1, offer: 2, ..WriterIdentity::default() }.sealed();
-        assert!(writer.is_intact());
-        assert!(!WriterIdentity { count: 2, ..writer }.is_intact());
-        assert!(!WriterIdentity { offer: 3, ..writer }.is_intact());
+        let endpoint = EndpointIdentity { count: 1, offer: 2, ..EndpointIdentity::default() }.sealed();
+        assert!(endpoint.is_intact());
+        assert!(!EndpointIdentity { count: 2, ..endpoint }.is_intact());
+        assert!(!EndpointIdentity { offer: 3, ..endpoint }.is_intact());
     }
 }

@@ -35,7 +35,7 @@ pub use health::{
     FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, MAX_PUBLISHERS, ProcessHealth,
     PublisherAccount, RouteInfo,
 };
-pub use identity::{LaneIdentity, WriterIdentity};
+pub use identity::{EndpointIdentity, ProcessIdentity};
 pub use modes::{LaneMode, ModeReason, SafetyMode, SubscriberState, TrafficClass, UnmatchedPolicy};
 pub use names::{InstanceName, LaneName, NameError, NodeName, RouteId, TopicName, TypeName};
 pub use network::{NetworkRefusal, NetworkRefusals};

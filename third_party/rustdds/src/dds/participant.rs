@@ -196,6 +196,24 @@ impl DomainParticipantBuilder {
     self
   }
 
+  /// Takes over the sockets of a participant whose process is gone, with what has arrived in
+  /// them since: those that its [`DomainParticipant::sockets`] returned, in any order. Those
+  /// of ports that this one does not have are closed. The participant has
+  /// [`DomainParticipant::sockets`] for a later one.
+  #[cfg(unix)]
+  pub fn with_sockets(mut self, sockets: Vec<std::net::UdpSocket>) -> Self {
+    self.hooks.sockets = Some(sockets);
+    self
+  }
+
+  /// Leaves what arrives for readers of the application in the sockets, until
+  /// [`DomainParticipant::receive_user_traffic`]: what arrives before there is a reader that is
+  /// matched with its writer is discarded.
+  pub fn holding_user_traffic(mut self) -> Self {
+    self.hooks.holds_user_traffic = true;
+    self
+  }
+
   /// Knows from the start what a former participant of the same identity knew of others: its
   /// [`DomainParticipant::discovery_journal`]. It is read as what comes from the network, and
   /// the participant can't be built if any of it is not sound. Readers that do not announce
@@ -722,6 +740,30 @@ impl DomainParticipant {
   /// Counts what this participant refuses of the network.
   pub fn network_counters(&self) -> Arc<crate::NetworkCounters> {
     discovery_db_read(&self.discovery_db()).counters()
+  }
+
+  /// Ends [`DomainParticipantBuilder::holding_user_traffic`].
+  pub fn receive_user_traffic(&self) {
+    if let Ok(dpi) = self.dpi.lock() {
+      let command = EventLoopCommand::ReceiveUserTraffic;
+      if dpi.dpi.stop_poll_sender.send(command).is_err() {
+        error!("dp_event_loop not responding to receive user traffic");
+      }
+    }
+  }
+
+  /// Duplicates of all sockets on which the participant receives, for one that continues it in
+  /// another process. What arrives while this process is gone waits in them, as long as any
+  /// process has them open. For a participant that was built with
+  /// [`DomainParticipantBuilder::with_sockets`], once; an error otherwise, or if there were no
+  /// descriptors.
+  #[cfg(unix)]
+  pub fn sockets(&self) -> io::Result<Vec<std::net::UdpSocket>> {
+    let sockets = match self.dpi.lock() {
+      Ok(mut dpi) => dpi.dpi.sockets.take(),
+      Err(_) => None,
+    };
+    sockets.unwrap_or_else(|| Err(io::Error::other("no sockets to keep")))
   }
 
   /// The sockets that user traffic comes to, for a thread of the application that
@@ -1481,6 +1523,9 @@ pub(crate) struct DomainParticipantInner {
   /// See `DomainParticipant::sockets_to_peek`.
   #[cfg(unix)]
   sockets_to_peek: Option<io::Result<Vec<std::net::UdpSocket>>>,
+  /// See `DomainParticipant::sockets`.
+  #[cfg(unix)]
+  sockets: Option<io::Result<Vec<std::net::UdpSocket>>>,
 }
 
 impl Drop for DomainParticipantInner {
@@ -1535,6 +1580,18 @@ impl DomainParticipantInner {
 
     let mut listeners = HashMap::new();
 
+    #[cfg(unix)]
+    let keeps_sockets = hooks.sockets.is_some();
+    let mut kept = hooks.sockets.take().unwrap_or_default();
+    let mut kept_with_port = |port: u16| {
+      let of_port = |socket: &std::net::UdpSocket| {
+        let address = socket.local_addr().ok();
+        address.is_some_and(|address| address.port() == port && address.ip().is_unspecified())
+      };
+      let place = kept.iter().position(of_port)?;
+      Some(kept.swap_remove(place))
+    };
+
     match UDPListener::new_multicast_with_buf_size(
       "0.0.0.0",
       spdp_well_known_multicast_port(domain_id),
@@ -1542,6 +1599,7 @@ impl DomainParticipantInner {
       socket_receive_buffer_size,
       &interfaces,
       only_networks.as_deref(),
+      kept_with_port(spdp_well_known_multicast_port(domain_id)),
     ) {
       Ok(l) => {
         listeners.insert(DISCOVERY_MUL_LISTENER_TOKEN, l);
@@ -1563,6 +1621,7 @@ impl DomainParticipantInner {
         spdp_well_known_unicast_port(domain_id, participant_id),
         socket_receive_buffer_size,
         &interfaces,
+        kept_with_port(spdp_well_known_unicast_port(domain_id, participant_id)),
       )
       .ok();
       if discovery_listener.is_none() {
@@ -1588,6 +1647,7 @@ impl DomainParticipantInner {
       socket_receive_buffer_size,
       &interfaces,
       only_networks.as_deref(),
+      kept_with_port(user_traffic_multicast_port(domain_id)),
     ) {
       Ok(l) => {
         listeners.insert(USER_TRAFFIC_MUL_LISTENER_TOKEN, l);
@@ -1600,6 +1660,7 @@ impl DomainParticipantInner {
       user_traffic_unicast_port(domain_id, participant_id),
       socket_receive_buffer_size,
       &interfaces,
+      kept_with_port(user_traffic_unicast_port(domain_id, participant_id)),
     )
     .or_else(|e| {
       if matches!(e.kind(), ErrorKind::AddrInUse) && continued_id.is_none() {
@@ -1610,6 +1671,7 @@ impl DomainParticipantInner {
           0,
           socket_receive_buffer_size,
           &interfaces,
+          None,
         )
         .or_else(|e| {
           create_error_out_of_resources!(
@@ -1627,11 +1689,24 @@ impl DomainParticipantInner {
     let user_data = std::mem::take(&mut hooks.user_data);
     let numbers = Arc::clone(&hooks.numbers);
     let mut urgent_topics = std::mem::take(&mut hooks.urgent_topics);
+    let continued_port = hooks.identity.map_or(0, |identity| identity.urgent_port);
     if !urgent_topics.is_empty() {
       let size = socket_receive_buffer_size;
-      match UDPListener::new_unicast_with_buf_size("0.0.0.0", 0, size, &interfaces) {
+      let socket = kept_with_port(continued_port);
+      match UDPListener::new_unicast_with_buf_size(
+        "0.0.0.0",
+        continued_port,
+        size,
+        &interfaces,
+        socket,
+      ) {
         Ok(listener) => {
           listeners.insert(URGENT_TRAFFIC_LISTENER_TOKEN, listener);
+        }
+        Err(e) if continued_port != 0 => {
+          return create_error_out_of_resources!(
+            "Could not open the port of urgent topics, {continued_port}: {e}"
+          )
         }
         // They are received as all others are.
         Err(e) => {
@@ -1650,9 +1725,12 @@ impl DomainParticipantInner {
       ]
       .iter()
       .filter_map(|token| listeners.get(token))
-      .map(UDPListener::socket_to_peek)
+      .map(UDPListener::duplicate)
       .collect()
     });
+
+    #[cfg(unix)]
+    let sockets = keeps_sockets.then(|| listeners.values().map(UDPListener::duplicate).collect());
 
     // construct our own Locators
     let listener_kinds = listeners
@@ -1803,6 +1881,8 @@ impl DomainParticipantInner {
       only_networks,
       #[cfg(unix)]
       sockets_to_peek,
+      #[cfg(unix)]
+      sockets,
     })
   }
 
@@ -2041,10 +2121,11 @@ impl DomainParticipantInner {
     let port = user_traffic_unicast_port(domain_id, participant_id);
     let listeners = &self.listener_kinds;
     let has_port = listeners.get(&USER_TRAFFIC_LISTENER_TOKEN) == Some(&(port, false));
-    let has_other_port = listeners.contains_key(&URGENT_TRAFFIC_LISTENER_TOKEN);
-    (has_port && !has_other_port).then(|| ParticipantIdentity {
+    let urgent_port = listeners.get(&URGENT_TRAFFIC_LISTENER_TOKEN).map_or(0, |(port, _)| *port);
+    has_port.then(|| ParticipantIdentity {
       prefix: domain_participant_guid.prefix.bytes,
       participant_id,
+      urgent_port,
       highest_count: self.numbers.highest_count(),
       highest_number: self.numbers.highest_number().into(),
     })
@@ -2187,6 +2268,56 @@ mod tests {
       ..reserved
     };
     assert!(DomainParticipantBuilder::new(domain).continuing(beyond).build().is_err());
+  }
+
+  // What others sent while there was no process is received by the next one, whose sockets have
+  // the same ports, the one of the urgent topics too; but not before it has readers.
+  #[test]
+  #[cfg(unix)]
+  fn a_participant_takes_over_the_sockets_of_a_former_one() {
+    let domain = test_domain_id(50);
+    let urgent = || ["t".to_string()];
+    let former = DomainParticipantBuilder::new(domain)
+      .with_urgent_topics(urgent())
+      .with_sockets(Vec::new())
+      .build()
+      .unwrap();
+    let identity = announced(&former, 0);
+    assert_ne!(identity.urgent_port, 0);
+    let kept = former.sockets().unwrap();
+    assert!(former.sockets().is_err(), "they were taken");
+    let ports = |sockets: &[std::net::UdpSocket]| -> std::collections::BTreeSet<u16> {
+      sockets.iter().map(|socket| socket.local_addr().unwrap().port()).collect()
+    };
+    let former_ports = ports(&kept);
+    assert_eq!(former_ports.len(), 5);
+    drop(former);
+
+    let other = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    other.send_to(b"not RTPS", ("127.0.0.1", identity.urgent_port)).unwrap();
+    let continued = |sockets| {
+      DomainParticipantBuilder::new(domain)
+        .with_urgent_topics(urgent())
+        .continuing(identity)
+        .with_sockets(sockets)
+        .holding_user_traffic()
+        .build()
+    };
+    assert!(continued(Vec::new()).is_err(), "the ports are taken by what was kept");
+    let peeked = kept.iter().find(|socket| {
+      socket.local_addr().unwrap().port() == identity.urgent_port
+    });
+    let peeked = peeked.unwrap().try_clone().unwrap();
+    let after = continued(kept).unwrap();
+    assert_eq!(ports(&after.sockets().unwrap()), former_ports);
+    let waits = || peeked.peek(&mut [0; 16]).is_ok();
+    std::thread::sleep(std::time::Duration::from_millis(100));
+    assert!(waits(), "received without readers");
+    after.receive_user_traffic();
+    while waits() {
+      std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+    assert_eq!(announced(&after, 0).urgent_port, identity.urgent_port);
   }
 
   // A writer with a given entity id tells each number that it gives, the first one too.

@@ -470,6 +470,13 @@ fn writer_kind(topic: &Topic) -> EntityKind {
   }
 }
 
+fn reader_kind(topic: &Topic) -> EntityKind {
+  match topic.kind() {
+    TopicKind::WithKey => EntityKind::READER_WITH_KEY_USER_DEFINED,
+    TopicKind::NoKey => EntityKind::READER_NO_KEY_USER_DEFINED,
+  }
+}
+
 #[derive(Clone)]
 struct InnerPublisher {
   id: EntityId,
@@ -1052,6 +1059,27 @@ impl Subscriber {
       .create_simple_datareader_raw(self, topic, None, qos)
   }
 
+  /// As [`create_simple_datareader_raw`](Self::create_simple_datareader_raw), with the first
+  /// three bytes of the entity id, which no other reader of the participant may have: it counts
+  /// its own from 0. Of a participant that was built with
+  /// [`continuing`](crate::DomainParticipantBuilder::continuing), the writers that were matched
+  /// with the former reader of this id stay matched if topic, type, and QoS are the same.
+  pub fn create_simple_datareader_raw_continuing<D, DA>(
+    &self,
+    topic: &Topic,
+    qos: Option<QosPolicies>,
+    entity_key: [u8; 3],
+  ) -> CreateResult<no_key::SimpleDataReader<D, DA>>
+  where
+    D: 'static,
+    DA: 'static + adapters::no_key::DeserializerAdapter<D>,
+  {
+    let entity_id = EntityId::new(entity_key, reader_kind(topic));
+    self
+      .inner
+      .create_simple_datareader_raw(self, topic, Some(entity_id), qos)
+  }
+
   pub fn create_datareader_no_key_cdr<D>(
     &self,
     topic: &Topic,
@@ -1487,11 +1515,8 @@ impl InnerSubscriber {
   where
     SA: adapters::no_key::DeserializerAdapter<D> + 'static,
   {
-    let (kind, has_keys) = match topic.kind() {
-      TopicKind::WithKey => (EntityKind::READER_WITH_KEY_USER_DEFINED, true),
-      TopicKind::NoKey => (EntityKind::READER_NO_KEY_USER_DEFINED, false),
-    };
-    let entity_id = self.unwrap_or_new_entity_id(entity_id_opt, kind)?;
+    let has_keys = topic.kind() == TopicKind::WithKey;
+    let entity_id = self.unwrap_or_new_entity_id(entity_id_opt, reader_kind(topic))?;
 
     let d = self.create_simple_datareader_internal::<NoKeyWrapper<D>, DAWrapper<SA>>(
       outer,

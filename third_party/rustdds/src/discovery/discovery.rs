@@ -1412,6 +1412,16 @@ impl Discovery {
             discovered_reader_data,
           });
         }
+        Known::Writer(data) => {
+          let update = discovery_db_write(&self.discovery_db).update_publication(&data);
+          let Some(discovered_writer_data) = update else {
+            continue; // no room
+          };
+          self.unconfirmed.insert(data.writer_proxy.remote_writer_guid);
+          self.send_discovery_notification(DiscoveryNotificationType::WriterUpdated {
+            discovered_writer_data,
+          });
+        }
       }
     }
     if !self.unconfirmed.is_empty() {
@@ -1422,16 +1432,23 @@ impl Discovery {
     }
   }
 
-  // A reader that ended while there was no process to hear of it. In case it is there all the
-  // same, its participant is to discover this one anew, and to announce all that it has.
+  // An endpoint that ended while there was no process to hear of it. In case it is there all
+  // the same, its participant is to discover this one anew, and to announce all that it has.
   fn drop_unconfirmed(&mut self) {
     let mut participants = BTreeSet::new();
-    for reader in std::mem::take(&mut self.unconfirmed) {
-      let is_there = discovery_db_read(&self.discovery_db).get_topic_reader(&reader).is_some();
-      if is_there {
-        participants.insert(reader.prefix);
-        self.reader_is_gone(reader);
+    for endpoint in std::mem::take(&mut self.unconfirmed) {
+      let db = discovery_db_read(&self.discovery_db);
+      let is_reader = db.get_topic_reader(&endpoint).is_some();
+      let is_writer = db.get_topic_writer(&endpoint).is_some();
+      drop(db);
+      if is_reader {
+        self.reader_is_gone(endpoint);
+      } else if is_writer {
+        self.writer_is_gone(endpoint);
+      } else {
+        continue;
       }
+      participants.insert(endpoint.prefix);
     }
     for prefix in participants {
       self.reintroduce_to(prefix);
@@ -1442,6 +1459,15 @@ impl Discovery {
     discovery_db_write(&self.discovery_db).remove_topic_reader(guid);
     self.send_discovery_notification(DiscoveryNotificationType::ReaderLost { reader_guid: guid });
     self.send_participant_status(DomainParticipantStatusEvent::ReaderLost {
+      guid,
+      reason: LostReason::Disposed,
+    });
+  }
+
+  fn writer_is_gone(&mut self, guid: GUID) {
+    discovery_db_write(&self.discovery_db).remove_topic_writer(guid);
+    self.send_discovery_notification(DiscoveryNotificationType::WriterLost { writer_guid: guid });
+    self.send_participant_status(DomainParticipantStatusEvent::WriterLost {
       guid,
       reason: LostReason::Disposed,
     });
@@ -1659,6 +1685,7 @@ impl Discovery {
         match d {
           Sample::Value(dwd) => {
             trace!("sedp_receive_publication discovered {:?}", dwd);
+            self.unconfirmed.remove(&dwd.writer_proxy.remote_writer_guid);
             let update = discovery_db_write(&self.discovery_db).update_publication(&dwd);
             let Some(discovered_writer_data) = update else {
               continue;
@@ -1669,16 +1696,8 @@ impl Discovery {
             debug!("Discovered Writer {:?}", dwd);
           }
           Sample::Dispose(writer_key) => {
-            discovery_db_write(&self.discovery_db).remove_topic_writer(writer_key);
-            self.send_discovery_notification(DiscoveryNotificationType::WriterLost {
-              writer_guid: writer_key,
-            });
-            self.send_participant_status(DomainParticipantStatusEvent::WriterLost {
-              guid: writer_key,
-              reason: LostReason::Disposed,
-            });
-
-            debug!("Disposed Writer {writer_key:?}");
+            debug!("Dispose Writer {writer_key:?}");
+            self.writer_is_gone(writer_key);
           }
         }
       }

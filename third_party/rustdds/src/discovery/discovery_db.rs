@@ -447,7 +447,6 @@ impl DiscoveryDB {
     self.external_topic_readers.get(guid)
   }
 
-  #[cfg(feature = "security")]
   pub fn get_topic_writer(&self, guid: &GUID) -> Option<&DiscoveredWriterData> {
     self.external_topic_writers.get(guid)
   }
@@ -945,6 +944,17 @@ impl DiscoveryDB {
       .filter(|reader| self.is_local_topic(reader.subscription_topic_data.topic_name()))
   }
 
+  /// The writers of a participant whose topics are ours, too.
+  pub fn writers_of_local_topics(
+    &self,
+    prefix: GuidPrefix,
+  ) -> impl Iterator<Item = &DiscoveredWriterData> {
+    let writers = self.external_topic_writers.range(prefix.range());
+    writers
+      .map(|(_, writer)| writer)
+      .filter(|writer| self.is_local_topic(&writer.publication_topic_data.topic_name))
+  }
+
   // Note:
   // If multiple participants announce the same topic, this will
   // return duplicates, one per announcing participant.
@@ -1139,6 +1149,20 @@ pub(crate) mod tests {
     let id = EntityId::create_custom_entity_id(key, EntityKind::READER_NO_KEY_USER_DEFINED);
     reader.reader_proxy.remote_reader_guid = GUID::new(participant.prefix, id);
     reader
+  }
+
+  pub(crate) fn new_writer(participant: GUID, number: u32, topic: &str) -> DiscoveredWriterData {
+    use crate::discovery::sedp_messages::PublicationBuiltinTopicData;
+    let [_, key @ ..] = number.to_be_bytes();
+    let id = EntityId::create_custom_entity_id(key, EntityKind::WRITER_NO_KEY_USER_DEFINED);
+    let guid = GUID::new(participant.prefix, id);
+    let (topic, dds_type) = (topic.to_string(), "RandomData".to_string());
+    DiscoveredWriterData {
+      last_updated: Instant::now(),
+      writer_proxy: WriterProxy::new(guid, Vec::new(), Vec::new()),
+      publication_topic_data: PublicationBuiltinTopicData::new(guid, None, topic, dds_type, None),
+      user_data: Vec::new(),
+    }
   }
 
   #[test]

@@ -7,7 +7,8 @@ use std::collections::BTreeSet;
 
 use crate::{
   discovery::{
-    discovery_db::DiscoveryDB, sedp_messages::DiscoveredReaderData,
+    discovery_db::DiscoveryDB,
+    sedp_messages::{DiscoveredReaderData, DiscoveredWriterData},
     spdp_participant_data::SpdpDiscoveredParticipantData,
   },
   serialization::pl_cdr_adapters::{PlCdrDeserialize, PlCdrSerialize},
@@ -23,15 +24,17 @@ pub(crate) const ENCODING: RepresentationIdentifier = RepresentationIdentifier::
 // announcement as it goes over the network, without an encapsulation header.
 const PARTICIPANT: u8 = 1;
 pub(crate) const READER: u8 = 2;
+const WRITER: u8 = 3;
 
 /// A record of a journal.
 #[derive(Debug)]
 pub(crate) enum Known {
   Participant(SpdpDiscoveredParticipantData),
   Reader(DiscoveredReaderData),
+  Writer(DiscoveredWriterData),
 }
 
-/// The participants in the database but `own`, each followed by its readers of topics of ours.
+/// The participants in the database but `own`, each followed by its readers and writers of topics of ours.
 pub(crate) fn write(db: &DiscoveryDB, own: GuidPrefix) -> Vec<u8> {
   let mut journal = Vec::new();
   for prefix in db.participant_prefixes(|data| data.participant_guid.prefix != own) {
@@ -41,6 +44,9 @@ pub(crate) fn write(db: &DiscoveryDB, own: GuidPrefix) -> Vec<u8> {
     append(&mut journal, PARTICIPANT, participant);
     for reader in db.readers_of_local_topics(prefix) {
       append(&mut journal, READER, reader);
+    }
+    for writer in db.writers_of_local_topics(prefix) {
+      append(&mut journal, WRITER, writer);
     }
   }
   journal
@@ -66,7 +72,7 @@ pub(crate) fn next_record<'a>(journal: &mut &'a [u8]) -> Option<(u8, &'a [u8])> 
 }
 
 /// Reads a journal as what comes from the network, and all of it: `None` if any record is
-/// malformed, is that of `own`, or is a reader's without its participant before it.
+/// malformed, is that of `own`, or is an endpoint's without its participant before it.
 pub(crate) fn read(mut journal: &[u8], own: GuidPrefix) -> Option<Vec<Known>> {
   if journal.len() > MAX_JOURNAL_BYTES {
     return None;
@@ -92,6 +98,13 @@ pub(crate) fn read(mut journal: &[u8], own: GuidPrefix) -> Option<Vec<Known>> {
         }
         Known::Reader(data)
       }
+      WRITER => {
+        let data = DiscoveredWriterData::from_pl_cdr_bytes(bytes, ENCODING).ok()?;
+        if !prefixes.contains(&data.writer_proxy.remote_writer_guid.prefix) {
+          return None;
+        }
+        Known::Writer(data)
+      }
       _ => return None,
     });
   }
@@ -103,13 +116,13 @@ mod tests {
   use super::*;
   use crate::{
     dds::statusevents::sync_status_channel,
-    discovery::discovery_db::tests::{new_participant, new_reader},
+    discovery::discovery_db::tests::{new_participant, new_reader, new_writer},
     structure::guid::GUID,
   };
 
-  // The journal of a database with two participants, of which one has a reader of a topic of
-  // ours and one of another topic; and the former reader.
-  fn journal() -> (Vec<u8>, GUID) {
+  // The journal of a database with two participants, of which one has a reader and a writer of
+  // a topic of ours and of another topic; and the former two.
+  fn journal() -> (Vec<u8>, GUID, GUID) {
     let (updated_sender, _updated_receiver) = std::sync::mpsc::sync_channel::<()>(4);
     let (status_sender, _status_receiver) = sync_status_channel(16).unwrap();
     let own = GUID::new_participant_guid();
@@ -117,15 +130,18 @@ mod tests {
     db.update_local_topic_reader(new_reader(own, 1, "ours"));
     let mut own_data = new_participant();
     own_data.participant_guid = own;
-    let (with_reader, without) = (new_participant(), new_participant());
-    for data in [&own_data, &with_reader, &without] {
+    let (with_endpoints, without) = (new_participant(), new_participant());
+    for data in [&own_data, &with_endpoints, &without] {
       db.update_participant(data);
     }
-    let participant = with_reader.participant_guid;
-    let reader = new_reader(participant, 2, "ours");
+    let participant = with_endpoints.participant_guid;
+    let (reader, writer) = (new_reader(participant, 2, "ours"), new_writer(participant, 4, "ours"));
     db.update_subscription(&reader);
     db.update_subscription(&new_reader(participant, 3, "another"));
-    (write(&db, own.prefix), reader.reader_proxy.remote_reader_guid)
+    db.update_publication(&writer);
+    db.update_publication(&new_writer(participant, 5, "another"));
+    let guids = (reader.reader_proxy.remote_reader_guid, writer.writer_proxy.remote_writer_guid);
+    (write(&db, own.prefix), guids.0, guids.1)
   }
 
   fn other() -> GuidPrefix {
@@ -133,17 +149,18 @@ mod tests {
   }
 
   #[test]
-  fn a_journal_has_the_others_and_their_readers_of_our_topics() {
-    let (bytes, reader) = journal();
+  fn a_journal_has_the_others_and_their_endpoints_of_our_topics() {
+    let (bytes, reader, writer) = journal();
     let known = read(&bytes, other()).unwrap();
-    let readers: Vec<GUID> = known
+    let endpoints: Vec<GUID> = known
       .iter()
       .filter_map(|known| match known {
         Known::Reader(data) => Some(data.reader_proxy.remote_reader_guid),
+        Known::Writer(data) => Some(data.writer_proxy.remote_writer_guid),
         Known::Participant(_) => None,
       })
       .collect();
-    assert_eq!((known.len(), readers), (3, vec![reader]));
+    assert_eq!((known.len(), endpoints), (4, vec![reader, writer]));
     assert!(read(&[], other()).unwrap().is_empty());
     // What this participant says of itself.
     assert!(read(&bytes, reader.prefix).is_none());
@@ -152,7 +169,7 @@ mod tests {
   // No byte sequence makes it panic, and none is taken in part.
   #[test]
   fn a_torn_or_changed_journal_is_refused_or_read_whole() {
-    let (bytes, _) = journal();
+    let (bytes, ..) = journal();
     let mut ends = Vec::new();
     let mut end = 0;
     while end < bytes.len() {
@@ -187,23 +204,24 @@ mod tests {
     assert!(read(&vec![0; MAX_JOURNAL_BYTES + 1], other()).is_none());
   }
 
-  // A reader alone could be one of any participant.
+  // An endpoint alone could be one of any participant.
   #[test]
-  fn a_reader_without_its_participant_is_refused() {
-    let (bytes, _) = journal();
+  fn an_endpoint_without_its_participant_is_refused() {
+    let (bytes, ..) = journal();
     let known = read(&bytes, other()).unwrap();
     let alone: Vec<Vec<u8>> = known
       .iter()
-      .filter_map(|known| match known {
-        Known::Reader(data) => {
-          let mut bytes = Vec::new();
-          append(&mut bytes, READER, data);
-          Some(bytes)
+      .filter_map(|known| {
+        let mut bytes = Vec::new();
+        match known {
+          Known::Reader(data) => append(&mut bytes, READER, data),
+          Known::Writer(data) => append(&mut bytes, WRITER, data),
+          Known::Participant(_) => return None,
         }
-        Known::Participant(_) => None,
+        Some(bytes)
       })
       .collect();
-    assert_eq!(alone.len(), 1);
-    assert!(read(&alone[0], other()).is_none());
+    assert_eq!(alone.len(), 2);
+    assert!(alone.iter().all(|alone| read(alone, other()).is_none()));
   }
 }

@@ -67,7 +67,13 @@ impl UDPListener {
     port: u16,
     reuse_addr: bool,
     recv_buffer_size: usize,
+    kept: Option<std::net::UdpSocket>,
   ) -> io::Result<mio1::net::UdpSocket> {
+    if let Some(socket) = kept {
+      // It has been bound, and has its options, since a former process opened it.
+      socket.set_nonblocking(true)?;
+      return Ok(mio1::net::UdpSocket::from_std(socket));
+    }
     let raw_socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
 
     if recv_buffer_size > 0 {
@@ -206,6 +212,10 @@ impl UDPListener {
         Ok(()) => {
           self.joined.insert(new);
         }
+        // The former process of a kept socket has joined it.
+        Err(e) if e.kind() == io::ErrorKind::AddrInUse => {
+          self.joined.insert(new);
+        }
         // Tried again with the next change.
         Err(e) => warn!("join_multicast_v4_n {group} on interface {new} failed: {e}"),
       }
@@ -215,7 +225,7 @@ impl UDPListener {
   #[cfg(test)]
   pub fn new_unicast(host: &str, port: u16) -> io::Result<Self> {
     let interfaces = crate::network::util::local_interface_table();
-    Self::new_unicast_with_buf_size(host, port, 0, &interfaces)
+    Self::new_unicast_with_buf_size(host, port, 0, &interfaces, None)
   }
 
   pub(crate) fn new_unicast_with_buf_size(
@@ -223,8 +233,9 @@ impl UDPListener {
     port: u16,
     recv_buffer_size: usize,
     interfaces: &[IfAddr],
+    kept: Option<std::net::UdpSocket>,
   ) -> io::Result<Self> {
-    let mio_socket = Self::new_listening_socket(host, port, false, recv_buffer_size)?;
+    let mio_socket = Self::new_listening_socket(host, port, false, recv_buffer_size, kept)?;
 
     Ok(Self {
       socket: mio_socket,
@@ -239,7 +250,7 @@ impl UDPListener {
   #[cfg(test)]
   pub fn new_multicast(host: &str, port: u16, multicast_group: Ipv4Addr) -> io::Result<Self> {
     let interfaces = crate::network::util::local_interface_table();
-    Self::new_multicast_with_buf_size(host, port, multicast_group, 0, &interfaces, None)
+    Self::new_multicast_with_buf_size(host, port, multicast_group, 0, &interfaces, None, None)
   }
 
   pub(crate) fn new_multicast_with_buf_size(
@@ -249,11 +260,12 @@ impl UDPListener {
     recv_buffer_size: usize,
     interfaces: &[IfAddr],
     only_networks: Option<&[NetworkSelector]>,
+    kept: Option<std::net::UdpSocket>,
   ) -> io::Result<Self> {
     if !multicast_group.is_multicast() {
       return io::Result::Err(io::Error::other("Not a multicast address"));
     }
-    let socket = Self::new_listening_socket(host, port, true, recv_buffer_size)?;
+    let socket = Self::new_listening_socket(host, port, true, recv_buffer_size, kept)?;
     // By default Linux delivers a group that any process has joined on an interface to
     // all sockets of its port (ip(7), IP_MULTICAST_ALL). A participant that has not yet
     // taken over a new address would hear a peer there, and answer with addresses at
@@ -277,9 +289,9 @@ impl UDPListener {
     Ok(listener)
   }
 
-  /// A duplicate of the socket, for a thread that peeks at datagrams and receives none.
+  /// A duplicate of the socket. It receives from the same queue.
   #[cfg(unix)]
-  pub fn socket_to_peek(&self) -> io::Result<std::net::UdpSocket> {
+  pub fn duplicate(&self) -> io::Result<std::net::UdpSocket> {
     use std::os::fd::AsFd;
     Ok(self.socket.as_fd().try_clone_to_owned()?.into())
   }

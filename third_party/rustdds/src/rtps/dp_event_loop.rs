@@ -73,9 +73,19 @@ pub struct DomainInfo {
   pub participant_id: u16,
 }
 
+fn is_user_traffic(token: Token) -> bool {
+  [
+    USER_TRAFFIC_LISTENER_TOKEN,
+    USER_TRAFFIC_MUL_LISTENER_TOKEN,
+    URGENT_TRAFFIC_LISTENER_TOKEN,
+  ]
+  .contains(&token)
+}
+
 pub(crate) enum EventLoopCommand {
   Stop,
   PrepareStop,
+  ReceiveUserTraffic,
 }
 
 pub struct DPEventLoop {
@@ -212,6 +222,9 @@ impl DPEventLoop {
     // so a datagram left in the socket cannot sit unreported.
     let mut udp_listeners = udp_listeners;
     for (token, listener) in &mut udp_listeners {
+      if hooks.holds_user_traffic && is_user_traffic(*token) {
+        continue;
+      }
       try_init!(
         poll
           .registry()
@@ -459,6 +472,7 @@ impl DPEventLoop {
   // their turn: the fragments of one large sample take milliseconds.
   fn receive(&mut self, token: Token) -> bool {
     let has_urgent = token != URGENT_TRAFFIC_LISTENER_TOKEN
+      && !self.hooks.holds_user_traffic
       && self
         .udp_listeners
         .contains_key(&URGENT_TRAFFIC_LISTENER_TOKEN);
@@ -497,6 +511,21 @@ impl DPEventLoop {
     true
   }
 
+  // The poll then reports what waits in the sockets.
+  fn receive_user_traffic(&mut self) {
+    if !std::mem::take(&mut self.hooks.holds_user_traffic) {
+      return;
+    }
+    for (token, listener) in &mut self.udp_listeners {
+      if is_user_traffic(*token) {
+        let registry = self.poll.registry();
+        if let Err(e) = registry.register(listener.mio_socket(), *token, Interest::READABLE) {
+          error!("Cannot receive user traffic: {e}");
+        }
+      }
+    }
+  }
+
   // Whether the application asks for another call soon.
   fn call_application(&mut self) -> bool {
     self.hooks.on_received.as_mut().is_some_and(|hook| hook())
@@ -520,6 +549,7 @@ impl DPEventLoop {
           info!("Stopping dp_event_loop");
           return true;
         }
+        Ok(EventLoopCommand::ReceiveUserTraffic) => self.receive_user_traffic(),
         Err(TryRecvError::Empty) => break,
         Err(TryRecvError::Disconnected) => {
           error!("Application thread has exited abnormally. Stopping RustDDS event loop.");

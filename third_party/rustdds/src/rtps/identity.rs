@@ -26,6 +26,9 @@ pub struct ParticipantIdentity {
   pub prefix: [u8; 12],
   /// The participant id, which gives the UDP ports (RTPS 2.5, clause 9.6.2.3).
   pub participant_id: u16,
+  /// The UDP port of [urgent topics](crate::DomainParticipantBuilder::with_urgent_topics); 0
+  /// without them.
+  pub urgent_port: u16,
   /// The highest count of any HEARTBEAT, ACKNACK or NACK_FRAG.
   pub highest_count: i32,
   /// The highest sequence number of any built-in writer.

@@ -1224,6 +1224,7 @@ mod tests {
     let identity = crate::ParticipantIdentity {
       prefix: [1; 12],
       participant_id: 0,
+      urgent_port: 0,
       highest_count: 500,
       highest_number: 4096,
     };

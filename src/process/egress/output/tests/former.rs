@@ -1,7 +1,7 @@
 //! What a killed process of a lane that keeps its identity leaves to the next one.
 
 use super::*;
-use crate::model::LaneIdentity;
+use crate::model::ProcessIdentity;
 
 /// The account of processes of a lane that keeps its identity. Each of the first three leaves a sample that
 /// is in the log and not counted; the last one has another writer.
@@ -9,8 +9,8 @@ use crate::model::LaneIdentity;
 fn a_killed_process_leaves_its_samples_with_their_numbers() {
     let mut host = Host::start(150, CRITICAL, SCAN);
     host.announce_type();
-    let identity = LaneIdentity { participant: host.participant.guid(), ..LaneIdentity::default() };
-    host.role.boards.lane_identity_writer(CRITICAL).set(identity.sealed());
+    let identity = ProcessIdentity { participant: host.participant.guid(), ..ProcessIdentity::default() };
+    host.role.boards.identity_writer(ProcessRole::Egress(CRITICAL)).set(identity.sealed());
     host.role.former.participant = identity.participant;
     let mut first = host.open();
     for sequence in 11..=14 {

@@ -1,5 +1,6 @@
 //! What a process leaves to the next one, with real boards, and when the next one takes it.
 
+use super::super::join;
 use super::*;
 use crate::process::role::participant_options;
 use crate::process::test_role::{self, SCAN, TYPE};
@@ -100,31 +101,11 @@ fn keys_are_those_of_no_other_writer() {
 }
 
 #[test]
-fn an_identity_is_given_up_if_others_may_not_know_it_or_it_has_changed() {
-    let participant = Guid([3; 16]);
-    let board = LaneIdentity { participant, conditions: 5, ..LaneIdentity::default() };
-    let alive_at = MonotonicNs(0).plus_ms(60_000);
-    let former = ProcessHealth { participant, alive_at, ..ProcessHealth::default() };
-    let at = |ms| alive_at.plus_ms(ms);
-    assert!(may_continue(&board.sealed(), &former, 5, at(200)));
-    assert!(may_continue(&board.sealed(), &former, 5, at(MAX_AWAY_MS)));
-    assert!(!may_continue(&board.sealed(), &former, 5, at(MAX_AWAY_MS + 1)));
-    assert!(!may_continue(&board.sealed(), &former, 6, at(200)));
-    assert!(!may_continue(&board, &former, 5, at(200)), "no checksum");
-    assert!(!may_continue(&LaneIdentity::default().sealed(), &ProcessHealth::default(), 0, at(0)));
-    let unproven = LaneIdentity { unproven: 1, ..board };
-    assert!(!may_continue(&unproven.sealed(), &former, 5, at(200)));
-    let ended = ProcessHealth { ended: 1, ..former };
-    assert!(!may_continue(&board.sealed(), &ended, 5, at(200)));
-    let of_another = ProcessHealth { participant: Guid([4; 16]), ..former };
-    assert!(!may_continue(&board.sealed(), &of_another, 5, at(200)));
-}
-
-#[test]
 fn a_noncritical_lane_keeps_no_identity() {
     let (mut role, settings, _folder) = test_role::open(ProcessRole::Egress(1), "egress", 72, SCAN);
     let options = participant_options(&settings, &settings.lanes[1].network, "egress");
-    let (participant, identity) = Identity::join(&mut role, &settings, 1, &options).unwrap();
+    let (participant, identity) =
+        join(&mut role, &settings.lanes[1], ProcessRole::Egress(1), "egress-noncritical", &options).unwrap();
     assert!(identity.is_none());
     assert!(WriterRecord::of(&role, &participant, 1, 0).is_none());
 }

@@ -1,0 +1,251 @@
+//! The identity that a process keeps over a kill: publishers or subscribers stay matched with it.
+//!
+//! The participant's GUID, ports and numbers are on a board, what it has discovered is in a journal, and its
+//! sockets are with the supervisor of the process. The next process goes on with them, unless there is a
+//! reason to be another participant: the former process has said goodbye, others may have dropped it, or it
+//! would announce something else. Then it is disposed of, as without an identity.
+
+use std::hash::{DefaultHasher, Hash, Hasher};
+
+use tracing::{info, warn};
+
+use super::kept_sockets;
+use super::role::{Role, RoleError};
+use crate::clock;
+use crate::dds::{DdsError, Kept, Participant, ParticipantIdentity, ParticipantOptions, host_addresses};
+use crate::model::{Guid, MonotonicNs, ProcessHealth, ProcessIdentity};
+use crate::shm::{BoardWriter, Journal, ProcessRole};
+
+/// The longest time without a process, below the lease of 15 s: then others drop the participant.
+const MAX_AWAY_MS: u64 = 10_000;
+
+/// How long a process that has taken an identity over runs until it has proven that this is not what ends it.
+const PROVEN_AFTER_MS: u64 = 1_000;
+
+/// The most processes that take an identity over, one after the other, and end before that.
+const MAX_UNPROVEN: u64 = 3;
+
+/// The share of the main thread's time that the journal takes at most: on a lane that thread sends, and a
+/// thousand participants that come and go change it with each housekeeping.
+const JOURNAL_SHARE: u64 = 20;
+
+/// What a process may use between two updates of the board, each 100 ms.
+const RESERVED_COUNTS: i32 = 1 << 16;
+const RESERVED_NUMBERS: i64 = 1 << 12;
+
+/// The identity of the participant of a process, and the journal of its discovery.
+pub(super) struct Identity {
+    board: BoardWriter<ProcessIdentity>,
+    journal: Journal,
+    conditions: u64,
+    /// Whether the next process may continue this one.
+    is_kept: bool,
+    proven_at: MonotonicNs,
+    /// Whether discovery has changed since the journal was written.
+    is_outdated: bool,
+    journal_at: MonotonicNs,
+}
+
+impl Identity {
+    /// Opens the participant of the role `name`, as that of the former process if that is possible and it may
+    /// be `continued`. Returns the identity to keep, and whether it is the former one.
+    pub fn join(
+        role: &mut Role,
+        process: ProcessRole,
+        name: &str,
+        may_be_continued: bool,
+        options: &ParticipantOptions,
+        open: impl Fn(Kept) -> Result<Participant, DdsError>,
+    ) -> Result<(Participant, Self, bool), RoleError> {
+        let mut identity = Self {
+            board: role.boards.identity_writer(process),
+            journal: Journal::of(&role.node, name),
+            conditions: conditions(options)?,
+            is_kept: true,
+            proven_at: clock::monotonic().plus_ms(PROVEN_AFTER_MS),
+            is_outdated: false,
+            journal_at: MonotonicNs(0),
+        };
+        let sockets = kept_sockets::inherited();
+        let inherited = sockets.len();
+        let former = if may_be_continued { identity.former(role) } else { None };
+        let mut kept = Some(Kept { former, sockets });
+        let continues = |kept: &mut Kept| kept.former.is_some();
+        let former = kept.take_if(continues).and_then(|kept| {
+            identity.board.update(|board| {
+                *board = ProcessIdentity { unproven: board.unproven + 1, ..*board }.sealed();
+            });
+            match open(kept) {
+                Ok(participant) => Some(participant),
+                Err(error) => {
+                    role.failed();
+                    warn!(role = name, %error, "cannot continue the former participant");
+                    None
+                }
+            }
+        });
+        let continued = former.is_some();
+        if let Some(participant) = &former {
+            role.former.participant = participant.guid();
+        } else {
+            // Also if the process that has taken it over died before it said so.
+            if identity.board.get().is_intact() && role.former.participant == Guid::default() {
+                role.former.participant = identity.board.get().participant;
+            }
+            identity.board.set(ProcessIdentity::default());
+            identity.journal.remove();
+        }
+        let participant = match former {
+            Some(participant) => participant,
+            None => open(kept.unwrap_or_default())?,
+        };
+        role.record_participant(&participant);
+        // Some of those that the supervisor has may be closed here.
+        kept_sockets::forget();
+        if let Err(error) = participant.sockets().and_then(|sockets| kept_sockets::store(&sockets)) {
+            warn!(role = name, %error, "the sockets are not kept; after a kill, what arrives meanwhile is lost");
+        }
+        let unproven = if continued { identity.board.get().unproven } else { 0 };
+        identity.record(&participant, unproven);
+        info!(role = name, participant = ?participant.guid(), continued, sockets = inherited, "identity");
+        Ok((participant, identity, continued))
+    }
+
+    /// What the former process has left, if this one may continue it.
+    fn former(&self, role: &mut Role) -> Option<(ParticipantIdentity, Vec<u8>)> {
+        let board = *self.board.get();
+        if !may_continue(&board, &role.former, self.conditions, clock::monotonic()) {
+            return None;
+        }
+        let identity = ParticipantIdentity {
+            participant: board.participant,
+            participant_id: board.participant_id.try_into().ok()?,
+            urgent_port: board.urgent_port.try_into().ok()?,
+            highest_count: board.highest_count.try_into().ok()?,
+            highest_number: board.highest_number.try_into().ok()?,
+        };
+        match self.journal.read(board.participant) {
+            Ok(journal) => Some((identity, journal?)),
+            Err(error) => {
+                role.failed();
+                warn!(%error, "refused the journal of discovery of the former process");
+                None
+            }
+        }
+    }
+
+    /// Keeps the board ahead of the numbers that the participant uses.
+    fn record(&mut self, participant: &Participant, unproven: u64) {
+        let Some(used) = participant.identity().filter(|_| self.is_kept) else {
+            return self.end();
+        };
+        let former = *self.board.get();
+        let ahead = |reserved: u64, used: i64, reserve: i64| {
+            let used = used.cast_unsigned();
+            if reserved < used + reserve.cast_unsigned() / 2 {
+                used + reserve.cast_unsigned()
+            } else {
+                reserved
+            }
+        };
+        let (count, number) = (i64::from(used.highest_count), used.highest_number);
+        let board = ProcessIdentity {
+            participant: used.participant,
+            participant_id: used.participant_id.into(),
+            urgent_port: used.urgent_port.into(),
+            highest_count: ahead(former.highest_count, count, RESERVED_COUNTS.into()),
+            highest_number: ahead(former.highest_number, number, RESERVED_NUMBERS),
+            conditions: self.conditions,
+            unproven,
+            alive_at: clock::monotonic(),
+            ..ProcessIdentity::default()
+        };
+        self.board.set(board.sealed());
+    }
+
+    /// Updates the board, and the journal if discovery has changed. `may_be_kept` is whether all endpoints
+    /// can be continued.
+    pub fn housekeeping(
+        &mut self,
+        participant: &Participant,
+        discovery_changed: bool,
+        may_be_kept: bool,
+        now: MonotonicNs,
+    ) {
+        self.is_kept &= may_be_kept;
+        let unproven = if now < self.proven_at { self.board.get().unproven } else { 0 };
+        self.record(participant, unproven);
+        self.is_outdated |= discovery_changed;
+        if !self.is_kept || !self.is_outdated || now < self.journal_at {
+            return;
+        }
+        self.is_outdated = false;
+        if let Err(error) = self.journal.write(participant.guid(), &participant.discovery_journal()) {
+            warn!(%error, "cannot write the journal of discovery; after a kill, others match anew");
+        }
+        self.journal_at = now.plus_ns(clock::monotonic().since(now) * JOURNAL_SHARE);
+    }
+
+    /// The next process does not continue this one: it says goodbye, or announces what the next one cannot.
+    pub fn end(&mut self) {
+        if self.board.get().is_intact() {
+            kept_sockets::forget();
+        }
+        self.is_kept = false;
+        self.board.set(ProcessIdentity::default());
+        self.journal.remove();
+    }
+}
+
+/// Whether a former process has left an identity that this one may continue.
+fn may_continue(board: &ProcessIdentity, former: &ProcessHealth, conditions: u64, now: MonotonicNs) -> bool {
+    board.is_intact()
+        && board.participant != Guid::default()
+        // The former process may have died before it had a participant.
+        && [board.participant, Guid::default()].contains(&former.participant)
+        && board.conditions == conditions
+        && board.unproven < MAX_UNPROVEN
+        && former.ended == 0
+        && now.since(board.alive_at) <= MAX_AWAY_MS * 1_000_000
+}
+
+/// A hash of what the participant announces, and of the addresses that others keep of it.
+fn conditions(options: &ParticipantOptions) -> Result<u64, RoleError> {
+    let mut addresses = host_addresses()?;
+    addresses.sort_unstable();
+    let network = options.network;
+    let mut hasher = DefaultHasher::new();
+    (network.domain_id, format!("{:?}", network.interfaces), addresses).hash(&mut hasher);
+    (&options.namespace, &options.node_name, options.graph_gid_bytes).hash(&mut hasher);
+    env!("CARGO_PKG_VERSION").hash(&mut hasher);
+    Ok(hasher.finish())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_identity_is_given_up_if_others_may_not_know_it_or_it_has_changed() {
+        let participant = Guid([3; 16]);
+        let alive_at = MonotonicNs(0).plus_ms(60_000);
+        let board = ProcessIdentity { participant, conditions: 5, alive_at, ..ProcessIdentity::default() };
+        let former = ProcessHealth { participant, ..ProcessHealth::default() };
+        let at = |ms| alive_at.plus_ms(ms);
+        assert!(may_continue(&board.sealed(), &former, 5, at(200)));
+        assert!(may_continue(&board.sealed(), &former, 5, at(MAX_AWAY_MS)));
+        assert!(!may_continue(&board.sealed(), &former, 5, at(MAX_AWAY_MS + 1)));
+        assert!(!may_continue(&board.sealed(), &former, 6, at(200)));
+        assert!(!may_continue(&board, &former, 5, at(200)), "no checksum");
+        assert!(!may_continue(&ProcessIdentity::default().sealed(), &ProcessHealth::default(), 0, at(0)));
+        let unproven = |unproven| ProcessIdentity { unproven, ..board }.sealed();
+        assert!(may_continue(&unproven(MAX_UNPROVEN - 1), &former, 5, at(200)));
+        assert!(!may_continue(&unproven(MAX_UNPROVEN), &former, 5, at(200)));
+        let ended = ProcessHealth { ended: 1, ..former };
+        assert!(!may_continue(&board.sealed(), &ended, 5, at(200)));
+        let without = ProcessHealth { participant: Guid::default(), ..former };
+        assert!(may_continue(&board.sealed(), &without, 5, at(200)));
+        let of_another = ProcessHealth { participant: Guid([4; 16]), ..former };
+        assert!(!may_continue(&board.sealed(), &of_another, 5, at(200)));
+    }
+}
