@@ -22,8 +22,15 @@ const MAX_AWAY_MS: u64 = 10_000;
 /// How long a process that has taken an identity over runs until it has proven that this is not what ends it.
 const PROVEN_AFTER_MS: u64 = 1_000;
 
-/// The most processes that take an identity over, one after the other, and end before that.
-const MAX_UNPROVEN: u64 = 3;
+/// The most processes that take an identity over, one after the other, and end before that. On a lane one: of
+/// three processes that continued each other within a second, the last one counted 88 samples as forwarded
+/// that a subscriber did not get.
+const fn max_unproven(process: ProcessRole) -> u64 {
+    match process {
+        ProcessRole::Ingress => 3,
+        ProcessRole::Control | ProcessRole::Egress(_) => 1,
+    }
+}
 
 /// The share of the main thread's time that the journal takes at most: on a lane that thread sends, and a
 /// thousand participants that come and go change it with each housekeeping.
@@ -38,6 +45,7 @@ pub(super) struct Identity {
     board: BoardWriter<ProcessIdentity>,
     journal: Journal,
     conditions: u64,
+    max_unproven: u64,
     /// Whether the next process may continue this one.
     is_kept: bool,
     proven_at: MonotonicNs,
@@ -61,6 +69,7 @@ impl Identity {
             board: role.boards.identity_writer(process),
             journal: Journal::of(&role.node, name),
             conditions: conditions(options)?,
+            max_unproven: max_unproven(process),
             is_kept: true,
             proven_at: clock::monotonic().plus_ms(PROVEN_AFTER_MS),
             is_outdated: false,
@@ -114,7 +123,8 @@ impl Identity {
     /// What the former process has left, if this one may continue it.
     fn former(&self, role: &mut Role) -> Option<(ParticipantIdentity, Vec<u8>)> {
         let board = *self.board.get();
-        if !may_continue(&board, &role.former, self.conditions, clock::monotonic()) {
+        let now = clock::monotonic();
+        if board.unproven >= self.max_unproven || !may_continue(&board, &role.former, self.conditions, now) {
             return None;
         }
         let identity = ParticipantIdentity {
@@ -204,7 +214,6 @@ fn may_continue(board: &ProcessIdentity, former: &ProcessHealth, conditions: u64
         // The former process may have died before it had a participant.
         && [board.participant, Guid::default()].contains(&former.participant)
         && board.conditions == conditions
-        && board.unproven < MAX_UNPROVEN
         && former.ended == 0
         && now.since(board.alive_at) <= MAX_AWAY_MS * 1_000_000
 }
@@ -238,9 +247,6 @@ mod tests {
         assert!(!may_continue(&board.sealed(), &former, 6, at(200)));
         assert!(!may_continue(&board, &former, 5, at(200)), "no checksum");
         assert!(!may_continue(&ProcessIdentity::default().sealed(), &ProcessHealth::default(), 0, at(0)));
-        let unproven = |unproven| ProcessIdentity { unproven, ..board }.sealed();
-        assert!(may_continue(&unproven(MAX_UNPROVEN - 1), &former, 5, at(200)));
-        assert!(!may_continue(&unproven(MAX_UNPROVEN), &former, 5, at(200)));
         let ended = ProcessHealth { ended: 1, ..former };
         assert!(!may_continue(&board.sealed(), &ended, 5, at(200)));
         let without = ProcessHealth { participant: Guid::default(), ..former };
