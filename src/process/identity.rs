@@ -55,8 +55,8 @@ pub(super) struct Identity {
 }
 
 impl Identity {
-    /// Opens the participant of the role `name`, as that of the former process if that is possible and it may
-    /// be `continued`. Returns the identity to keep, and whether it is the former one.
+    /// Opens the participant of the role `name`: that of the former process if `may_be_continued` and nothing
+    /// else speaks against it. Returns the identity to keep, and whether it is the former one.
     pub fn join(
         role: &mut Role,
         process: ProcessRole,
@@ -78,21 +78,20 @@ impl Identity {
         let sockets = kept_sockets::inherited();
         let inherited = sockets.len();
         let former = if may_be_continued { identity.former(role) } else { None };
-        let mut kept = Some(Kept { former, sockets });
-        let continues = |kept: &mut Kept| kept.former.is_some();
-        let former = kept.take_if(continues).and_then(|kept| {
+        let mut kept = Kept { former, sockets };
+        let mut former = None;
+        if kept.former.is_some() {
             identity.board.update(|board| {
                 *board = ProcessIdentity { unproven: board.unproven + 1, ..*board }.sealed();
             });
-            match open(kept) {
-                Ok(participant) => Some(participant),
+            match open(std::mem::take(&mut kept)) {
+                Ok(participant) => former = Some(participant),
                 Err(error) => {
                     role.failed();
                     warn!(role = name, %error, "cannot continue the former participant");
-                    None
                 }
             }
-        });
+        }
         let continued = former.is_some();
         if let Some(participant) = &former {
             role.former.participant = participant.guid();
@@ -103,14 +102,14 @@ impl Identity {
             }
             identity.board.set(ProcessIdentity::default());
             identity.journal.remove();
+            // Some of the sockets that the supervisor keeps may be closed here.
+            kept_sockets::forget();
         }
         let participant = match former {
             Some(participant) => participant,
-            None => open(kept.unwrap_or_default())?,
+            None => open(kept)?,
         };
         role.record_participant(&participant);
-        // Some of those that the supervisor has may be closed here.
-        kept_sockets::forget();
         if let Err(error) = participant.sockets().and_then(|sockets| kept_sockets::store(&sockets)) {
             warn!(role = name, %error, "the sockets are not kept; after a kill, what arrives meanwhile is lost");
         }
@@ -124,7 +123,7 @@ impl Identity {
     fn former(&self, role: &mut Role) -> Option<(ParticipantIdentity, Vec<u8>)> {
         let board = *self.board.get();
         let now = clock::monotonic();
-        if board.unproven >= self.max_unproven || !may_continue(&board, &role.former, self.conditions, now) {
+        if !may_continue(&board, &role.former, self.conditions, self.max_unproven, now) {
             return None;
         }
         let identity = ParticipantIdentity {
@@ -208,12 +207,19 @@ impl Identity {
 }
 
 /// Whether a former process has left an identity that this one may continue.
-fn may_continue(board: &ProcessIdentity, former: &ProcessHealth, conditions: u64, now: MonotonicNs) -> bool {
+fn may_continue(
+    board: &ProcessIdentity,
+    former: &ProcessHealth,
+    conditions: u64,
+    max_unproven: u64,
+    now: MonotonicNs,
+) -> bool {
     board.is_intact()
         && board.participant != Guid::default()
         // The former process may have died before it had a participant.
         && [board.participant, Guid::default()].contains(&former.participant)
         && board.conditions == conditions
+        && board.unproven < max_unproven
         && former.ended == 0
         && now.since(board.alive_at) <= MAX_AWAY_MS * 1_000_000
 }
@@ -241,17 +247,21 @@ mod tests {
         let board = ProcessIdentity { participant, conditions: 5, alive_at, ..ProcessIdentity::default() };
         let former = ProcessHealth { participant, ..ProcessHealth::default() };
         let at = |ms| alive_at.plus_ms(ms);
-        assert!(may_continue(&board.sealed(), &former, 5, at(200)));
-        assert!(may_continue(&board.sealed(), &former, 5, at(MAX_AWAY_MS)));
-        assert!(!may_continue(&board.sealed(), &former, 5, at(MAX_AWAY_MS + 1)));
-        assert!(!may_continue(&board.sealed(), &former, 6, at(200)));
-        assert!(!may_continue(&board, &former, 5, at(200)), "no checksum");
-        assert!(!may_continue(&ProcessIdentity::default().sealed(), &ProcessHealth::default(), 0, at(0)));
+        assert!(may_continue(&board.sealed(), &former, 5, 3, at(200)));
+        assert!(may_continue(&board.sealed(), &former, 5, 3, at(MAX_AWAY_MS)));
+        assert!(!may_continue(&board.sealed(), &former, 5, 3, at(MAX_AWAY_MS + 1)));
+        assert!(!may_continue(&board.sealed(), &former, 6, 3, at(200)));
+        assert!(!may_continue(&board, &former, 5, 3, at(200)), "no checksum");
+        assert!(!may_continue(&ProcessIdentity::default().sealed(), &ProcessHealth::default(), 0, 3, at(0)));
+        let unproven = |unproven| ProcessIdentity { unproven, ..board }.sealed();
+        assert!(may_continue(&unproven(2), &former, 5, 3, at(200)));
+        assert!(!may_continue(&unproven(3), &former, 5, 3, at(200)));
+        assert!(!may_continue(&unproven(1), &former, 5, 1, at(200)));
         let ended = ProcessHealth { ended: 1, ..former };
-        assert!(!may_continue(&board.sealed(), &ended, 5, at(200)));
+        assert!(!may_continue(&board.sealed(), &ended, 5, 3, at(200)));
         let without = ProcessHealth { participant: Guid::default(), ..former };
-        assert!(may_continue(&board.sealed(), &without, 5, at(200)));
+        assert!(may_continue(&board.sealed(), &without, 5, 3, at(200)));
         let of_another = ProcessHealth { participant: Guid([4; 16]), ..former };
-        assert!(!may_continue(&board.sealed(), &of_another, 5, at(200)));
+        assert!(!may_continue(&board.sealed(), &of_another, 5, 3, at(200)));
     }
 }

@@ -458,7 +458,7 @@ impl Supervised {
                 State::GaveUp
             }
         };
-        // Its peers know of an orderly end, and without a restart nobody would read the sockets.
+        // After an orderly end the next process is another participant; without a restart there is none.
         if let Some(sockets) = &mut self.sockets
             && (exit == ChildExit::Code(0) || self.state == State::GaveUp)
         {

@@ -71,8 +71,8 @@ fn subscribers_stay_matched_with_a_critical_lane_that_is_killed() {
     for Seen { name, matches, received } in subscribers {
         assert_eq!(matches, (1, 0), "{name}");
         received.assert_sound();
-        // Nobody repairs the sample that was numbered and not sent when the lane was killed: the next process
-        // sends it before it has matched the BEST_EFFORT subscribers.
+        // The next process sends the sample that was numbered and not sent when the lane was killed before it
+        // has matched its subscribers. RELIABLE ones request it.
         let most = if name.ends_with("BEST_EFFORT") { KILLS as u64 } else { 0 };
         assert!(received.missing_count <= most, "{name}: {received:?}");
     }
