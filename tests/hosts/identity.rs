@@ -10,6 +10,8 @@ use support::process::signal;
 
 const KILLS: usize = 5;
 const RATE_HZ: f64 = 200.0;
+/// Samples of 12 s. The next process drops an endpoint that does not announce itself within 10 s.
+const SAMPLES_AFTER: u64 = 2_400;
 
 /// What a subscriber saw.
 struct Seen {
@@ -41,6 +43,7 @@ fn kill(bed: &Bed, pause: Duration) -> Vec<Seen> {
         support::wait_until("a restart", || bed.pids("egress-critical").len() == kills + 1);
         all_receive(100);
     }
+    all_receive(SAMPLES_AFTER);
     let sent: Sent = publisher.end();
     sent.assert_not_blocked();
     bed.wait_accounted();

@@ -15,6 +15,9 @@ const RATE_HZ: f64 = 200.0;
 const KILLS: usize = 5;
 /// Samples that the subscriber receives between two kills.
 const SAMPLES_BETWEEN: u64 = 300;
+/// Samples that it receives after the last one, in 12 s. The next process drops an endpoint that does not
+/// announce itself within 10 s.
+const SAMPLES_AFTER: u64 = 2_400;
 
 /// What became of a publisher's samples over five kills.
 struct Kept {
@@ -38,6 +41,7 @@ fn kill_ingress_five_times(bed: &Bed, publisher: Peer, before_kill: impl Fn()) -
         support::wait_until("a restart", || bed.pids("ingress").len() == kills + 1);
         subscriber.wait_received(subscriber.received() + SAMPLES_BETWEEN);
     }
+    subscriber.wait_received(subscriber.received() + SAMPLES_AFTER);
     let matches = publisher.matches();
     let sent: Sent = publisher.end();
     assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");

@@ -1313,10 +1313,17 @@ impl Discovery {
     &mut self,
     participant_data: &SpdpDiscoveredParticipantData,
   ) {
+    if self.admit_participant(participant_data) {
+      self.tell_of_restored_endpoints(participant_data.participant_guid.prefix);
+    }
+  }
+
+  // Returns whether it is new.
+  fn admit_participant(&mut self, participant_data: &SpdpDiscoveredParticipantData) -> bool {
     let update = discovery_db_write(&self.discovery_db).update_participant(participant_data);
     let guid_prefix = participant_data.participant_guid.prefix;
     let was_new = match update {
-      ParticipantUpdate::Refused => return,
+      ParticipantUpdate::Refused => return false,
       ParticipantUpdate::Known => false,
       ParticipantUpdate::New { evicted } => {
         if let Some(evicted) = evicted {
@@ -1367,41 +1374,48 @@ impl Discovery {
           );
         }
       }
-
-      // This may be a rediscovery of a previously seen participant that
-      // was temporarily lost due to network outage. The loss has unmatched its
-      // endpoints, and what it announced of them is not announced again, or if
-      // it is, was read before. So tell of what the database has restored.
-      let (readers, writers) = discovery_db_read(&self.discovery_db).endpoints_of(guid_prefix);
-      for discovered_reader_data in readers {
-        self.send_discovery_notification(DiscoveryNotificationType::ReaderUpdated {
-          discovered_reader_data,
-        });
-      }
-      for discovered_writer_data in writers {
-        self.send_discovery_notification(DiscoveryNotificationType::WriterUpdated {
-          discovered_writer_data,
-        });
-      }
-
-      // Process the SEDP samples
-      // (topics, readers, writers) that are already pending in our discovery
-      // readers, so that we know what it has. Reading takes the samples out of
-      // the readers, so this processes the pending samples of all participants,
-      // not only those of this one.
-      debug!("Participant rediscovery start");
-      self.sedp_receive_topic_data(Some(guid_prefix));
-      self.sedp_receive_subscription(Some(guid_prefix));
-      self.sedp_receive_publication(Some(guid_prefix));
-      debug!("Participant rediscovery finished");
     }
+    was_new
   }
 
-  // As if those who are known had just announced themselves.
+  fn tell_of_restored_endpoints(&mut self, guid_prefix: GuidPrefix) {
+    // This may be a rediscovery of a previously seen participant that
+    // was temporarily lost due to network outage. The loss has unmatched its
+    // endpoints, and what it announced of them is not announced again, or if
+    // it is, was read before. So tell of what the database has restored.
+    let (readers, writers) = discovery_db_read(&self.discovery_db).endpoints_of(guid_prefix);
+    for discovered_reader_data in readers {
+      self.send_discovery_notification(DiscoveryNotificationType::ReaderUpdated {
+        discovered_reader_data,
+      });
+    }
+    for discovered_writer_data in writers {
+      self.send_discovery_notification(DiscoveryNotificationType::WriterUpdated {
+        discovered_writer_data,
+      });
+    }
+
+    // Process the SEDP samples
+    // (topics, readers, writers) that are already pending in our discovery
+    // readers, so that we know what it has. Reading takes the samples out of
+    // the readers, so this processes the pending samples of all participants,
+    // not only those of this one.
+    debug!("Participant rediscovery start");
+    self.sedp_receive_topic_data(Some(guid_prefix));
+    self.sedp_receive_subscription(Some(guid_prefix));
+    self.sedp_receive_publication(Some(guid_prefix));
+    debug!("Participant rediscovery finished");
+  }
+
+  // As if those who are known had just announced themselves. A participant may send its
+  // endpoints as soon as it is known: they are read afterwards, because what is read before
+  // an endpoint is in `unconfirmed` does not confirm it.
   fn take_over_known(&mut self) {
     for known in std::mem::take(&mut self.known) {
       match known {
-        Known::Participant(data) => self.process_discovered_participant_data(&data),
+        Known::Participant(data) => {
+          self.admit_participant(&data);
+        }
         Known::Reader(data) => {
           let update = discovery_db_write(&self.discovery_db).update_subscription(&data);
           let Some(discovered_reader_data) = update else {
@@ -1432,10 +1446,10 @@ impl Discovery {
     }
   }
 
-  // An endpoint that ended while there was no process to hear of it. In case it is there all
-  // the same, its participant is to discover this one anew, and to announce all that it has.
+  // Endpoints that ended while there was no process to hear of it. One that is there all the
+  // same, behind a link that is down, is matched when its announcement comes: the built-in
+  // readers ask for that until they have it.
   fn drop_unconfirmed(&mut self) {
-    let mut participants = BTreeSet::new();
     for endpoint in std::mem::take(&mut self.unconfirmed) {
       let db = discovery_db_read(&self.discovery_db);
       let is_reader = db.get_topic_reader(&endpoint).is_some();
@@ -1445,13 +1459,7 @@ impl Discovery {
         self.reader_is_gone(endpoint);
       } else if is_writer {
         self.writer_is_gone(endpoint);
-      } else {
-        continue;
       }
-      participants.insert(endpoint.prefix);
-    }
-    for prefix in participants {
-      self.reintroduce_to(prefix);
     }
   }
 
