@@ -229,7 +229,8 @@ fn routes(d: &mut Differences, old: &Settings, new: &Settings) {
 fn compare_route(d: &mut Differences, old: &Route, new: &Route) {
     let of = &format!("topics[{}]", old.entry);
     compare!(d, of, old, new, Route {
-        input_topic, message_type, max_sample_bytes, priority, retained_samples; id, entry, input_qos
+        input_topic, message_type, max_sample_bytes, priority, retained_samples; id, entry, input_qos,
+        backlog_samples
     });
     let of = &format!("{of}.qos_overrides.input");
     compare!(d, of, old.input_qos, new.input_qos, InputQos {

@@ -26,6 +26,10 @@ const MAX_EXCLUDED: usize = 64;
 const RETAINED_SAMPLES: RangeInclusive<usize> = 8..=256;
 const RETAINED_BYTES: usize = 16 << 20;
 
+/// The most samples that ingress keeps of a route in addition, as far as they fit a number of bytes: where a
+/// route allows large samples, most are still small. 512 are half a second at 1 kHz.
+const BACKLOG_SAMPLES: usize = 512;
+
 /// Of all routes together, each has an equal share of so many such samples. Each sample takes a page at
 /// least, so that they take 32 MiB before one comes.
 const RETAINED_IN_ALL: usize = 8_192;
@@ -73,6 +77,10 @@ pub(super) fn read(
         if draft.retains_by_size {
             let by_size = retained_by_size(route.max_sample_bytes, places);
             route.retained_samples = route.retained_samples.max(by_size);
+            let backlog = share_of(places).min(BACKLOG_SAMPLES);
+            if backlog > route.retained_samples {
+                route.backlog_samples = backlog;
+            }
         }
         if let Some(pattern) = draft.pattern {
             patterns.push(RoutePattern { first_route: routes.len(), ..pattern });
@@ -94,8 +102,12 @@ pub(super) fn read(
 /// The samples of at most so many bytes that each of so many routes retains for a restarted lane.
 fn retained_by_size(max_sample_bytes: usize, routes: usize) -> usize {
     let by_bytes = RETAINED_BYTES / max_sample_bytes.max(1);
-    let share = RETAINED_IN_ALL / routes.max(1);
-    by_bytes.min(share).clamp(*RETAINED_SAMPLES.start(), *RETAINED_SAMPLES.end())
+    by_bytes.min(share_of(routes)).clamp(*RETAINED_SAMPLES.start(), *RETAINED_SAMPLES.end())
+}
+
+/// The share of each of so many routes in the samples of all.
+const fn share_of(routes: usize) -> usize {
+    RETAINED_IN_ALL / if routes == 0 { 1 } else { routes }
 }
 
 /// One entry of `topics`, with the parts that are valid.
@@ -179,6 +191,7 @@ impl<'f> RouteReader<'_, 'f> {
                 max_sample_bytes: max_sample_bytes.unwrap_or(self.max_sample_bytes),
                 priority,
                 retained_samples: retained.unwrap_or(following),
+                backlog_samples: 0,
             }),
             _ => None,
         };
@@ -486,6 +499,13 @@ mod tests {
         ] {
             assert_eq!(retained(bytes, routes), samples, "{routes} routes of {bytes} bytes");
         }
+        let backlog = |text: &str| settings(text).routes[0].backlog_samples;
+        assert_eq!(backlog("topics: [{id: a, input_topic: /a}]"), 512);
+        assert_eq!(backlog("topics: [{id: a, input_topic: /a, max_sample_bytes: 1000}]"), 512);
+        assert_eq!(backlog("topics: [{id: a, input_topic: /a/**, max_routes: 64}]"), 128);
+        let route = |number| format!("- {{id: r{number}, input_topic: /r{number}}}\n");
+        assert_eq!(backlog(&format!("topics:\n{}", (0..1_024).map(route).collect::<String>())), 0);
+        assert_eq!(backlog("topics: [{id: a, input_topic: /a, retained_samples: 3}]"), 0);
         // Of a pattern, each place counts.
         let text = "topics: [{id: any, input_topic: /a/**, max_routes: 64, max_sample_bytes: 1000}]";
         assert_eq!(settings(text).routes[5].retained_samples, 128);

@@ -159,6 +159,9 @@ pub struct Route {
     /// Samples kept in shared memory for a restarted lane: those that it catches up with, and those that a
     /// `TRANSIENT_LOCAL` lane offers to late joiners.
     pub retained_samples: usize,
+    /// The most samples that ingress keeps in addition for a critical lane that restarts, as far as they fit
+    /// a number of bytes; 0 for none.
+    pub backlog_samples: usize,
 }
 
 /// What determines the input topic of a route.

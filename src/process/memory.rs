@@ -10,7 +10,8 @@ use super::egress::memory::{COPIES_BYTES, output_bytes};
 use super::ingress::memory::{PATTERN_BYTES, fragment_bytes, waiting_bytes};
 use crate::config::{Lane, Settings};
 use crate::dds::{DISCOVERY_BYTES, SOCKETS_BYTES};
-use crate::shm::{DEFAULT_BUDGET_BYTES, OTHER_SHARED_BYTES, RouteChannel};
+use crate::model::TrafficClass;
+use crate::shm::{DEFAULT_BUDGET_BYTES, OTHER_SHARED_BYTES, RouteChannel, most_backlog_bytes};
 
 const MIB: u64 = 1 << 20;
 
@@ -135,6 +136,11 @@ fn of_lane(settings: &Settings, lane: &Lane) -> MemoryNeed {
     for output in &lane.outputs {
         let route = &settings.routes[output.route];
         add(&mut need.history_bytes, output_bytes(lane, output, route.max_sample_bytes));
+    }
+    if lane.class() == TrafficClass::Critical {
+        // Copies of what it lacks when it restarts.
+        let routes = lane.outputs.iter().map(|output| &settings.routes[output.route]);
+        add(&mut need.history_bytes, most_backlog_bytes(routes));
     }
     need
 }

@@ -21,7 +21,7 @@ use super::send_log::SendLog;
 use super::wake::{LaneSleeper, LaneWaker};
 use crate::config::Settings;
 use crate::model::{
-    AbsenceRecord, ControlRecord, EndpointIdentity, IngressCounters, InstanceName, IntruderRecord,
+    AbsenceRecord, Backlog, ControlRecord, EndpointIdentity, IngressCounters, InstanceName, IntruderRecord,
     LaneCounters, LaneName, LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS,
     MAX_PUBLISHERS, MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, PartialSample, PatternRecord,
     ProcessHealth, ProcessIdentity, PublisherAccount, Reliability, RouteId, RouteInfo, SubscriberRecord,
@@ -79,7 +79,7 @@ pub enum Stage {
 }
 
 /// Incremented whenever the meaning of a word in the segment changes.
-const LAYOUT_VERSION: u32 = 13;
+const LAYOUT_VERSION: u32 = 14;
 /// The readers of a route: one for the publishers of each reliability.
 const READERS: usize = 2;
 /// "ABboards": the first word, by which a file of another program is rejected.
@@ -102,6 +102,7 @@ struct Layout {
     route_info: usize,
     pattern: usize,
     partial: usize,
+    backlog: usize,
     ingress: usize,
     publisher: usize,
     lane: usize,
@@ -137,6 +138,7 @@ impl Layout {
             route_info: next(routes * Cell::<RouteInfo>::WORDS),
             pattern: next(routes * Cell::<PatternRecord>::WORDS),
             partial: next(routes * Cell::<PartialSample>::WORDS),
+            backlog: next(routes * Cell::<Backlog>::WORDS),
             ingress: next(routes * Cell::<IngressCounters>::WORDS),
             publisher: next(routes * MAX_PUBLISHERS * Cell::<PublisherAccount>::WORDS),
             lane: next(lanes * routes * Cell::<LaneCounters>::WORDS),
@@ -251,6 +253,8 @@ boards! {
     pattern, pattern_writer(route: usize): PatternRecord = |layout| layout.check_route(route);
     /// The large sample of a route of which ingress has received a part.
     partial, partial_writer(route: usize): PartialSample = |layout| layout.check_route(route);
+    /// The samples of a route that ingress keeps for a lane that restarts.
+    backlog, backlog_writer(route: usize): Backlog = |layout| layout.check_route(route);
     /// The counters of ingress for a route.
     ingress, ingress_writer(route: usize): IngressCounters = |layout| layout.check_route(route);
     /// The account of the publisher of a route at an index below [`MAX_PUBLISHERS`].
@@ -493,6 +497,7 @@ mod tests {
             found.push(place(layout.route_info(route)));
             found.push(place(layout.pattern(route)));
             found.push(place(layout.partial(route)));
+            found.push(place(layout.backlog(route)));
             found.push(place(layout.ingress(route)));
             for reliability in [Reliability::BestEffort, Reliability::Reliable] {
                 found.push(place(layout.reader_identity(route, reliability)));

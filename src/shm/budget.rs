@@ -17,8 +17,8 @@ use super::channel::{LOANED_SLOTS, PoolSize, RouteChannel, SLOT_HEADER_BYTES, pa
 use super::error::ShmError;
 use super::root::SHM_DIR;
 use super::segment::{free_bytes, no_room};
-use crate::config::Settings;
-use crate::model::{FixedText, MonotonicNs};
+use crate::config::{Route, Settings};
+use crate::model::{Backlog, FixedText, MonotonicNs};
 use crate::policy::{BudgetRefusal, MemoryBudget, PoolDemand};
 
 /// The budget if the configuration sets none: this, or a quarter of the machine's memory if that is less,
@@ -26,6 +26,12 @@ use crate::policy::{BudgetRefusal, MemoryBudget, PoolDemand};
 /// lanes may hold. Two stalled lanes with five cameras of 6 MB hold 1.6 GiB.
 pub const DEFAULT_BUDGET_BYTES: u64 = 2 << 30;
 const DEFAULT_BUDGET_DIVISOR: u64 = 4;
+
+/// The most bytes of the samples that ingress keeps of a route: 1.3 s of 64 KiB at 200 Hz. Of all routes, and
+/// the share of the budget: what a lane that restarts may lack must not be what the present samples need.
+const MAX_BACKLOG_BYTES: u64 = 16 << 20;
+const MAX_BACKLOG_BYTES_IN_ALL: u64 = 128 << 20;
+const BACKLOG_DIVISOR: u64 = 8;
 
 /// The unit in which slots note when they had a sample: 0.1 s, as ingress does its housekeeping. 32 bits hold
 /// 13 years.
@@ -110,6 +116,20 @@ fn demand_of(channel: &RouteChannel, is_critical: bool) -> PoolDemand {
     let pool = channel.pool_size();
     let steady_samples = (channel.retained_samples + LOANED_SLOTS + 1) as u64;
     PoolDemand { first_bytes: pool.first_bytes, most_bytes: pool.bytes, steady_samples, is_critical }
+}
+
+/// The most bytes of samples that ingress keeps of one route for a lane that restarts: an equal share,
+/// because all routes together take at most an eighth of the budget.
+pub fn backlog_bytes(settings: &Settings) -> u64 {
+    let all = MAX_BACKLOG_BYTES_IN_ALL.min(budget_bytes(settings) / BACKLOG_DIVISOR);
+    MAX_BACKLOG_BYTES.min(all / settings.routes.len().max(1) as u64)
+}
+
+/// The most bytes of samples that ingress keeps of these routes, whatever the budget.
+pub fn most_backlog_bytes<'a>(routes: impl Iterator<Item = &'a Route>) -> u64 {
+    let of_route = |route: &Route| (route.backlog_samples * route.max_sample_bytes) as u64;
+    let of_all: u64 = routes.map(|route| of_route(route).min(MAX_BACKLOG_BYTES)).sum();
+    of_all.min(MAX_BACKLOG_BYTES_IN_ALL)
 }
 
 /// The budget of the configuration, or the default on this machine.
@@ -217,6 +237,17 @@ impl SlotMemory {
     /// The name of the pool's file, and where a payload at this address begins in it.
     pub(super) fn place(&self, payload: usize) -> (FixedText, u64) {
         (self.name, self.first_offset + payload.wrapping_sub(self.first_address) as u64)
+    }
+
+    /// Where the slots are, for a backlog of which no sample is kept yet.
+    pub(super) fn empty_backlog(&self) -> Backlog {
+        Backlog {
+            first_sequence: 0,
+            first_offset: self.first_offset,
+            stride_bytes: self.pool.stride_bytes,
+            slots: self.pool.slots as u64,
+            pool: self.name,
+        }
     }
 
     /// Notes the size of a complete sample, of which other routes leave this one room for a steady flow. What

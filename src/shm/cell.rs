@@ -11,7 +11,7 @@ use std::sync::atomic::{Ordering, fence};
 
 use super::segment::Segment;
 use crate::model::{
-    AbsenceRecord, ControlRecord, DropReason, EndpointIdentity, IngressCounters, IntruderRecord,
+    AbsenceRecord, Backlog, ControlRecord, DropReason, EndpointIdentity, IngressCounters, IntruderRecord,
     LaneCounters, LanePolicy, LatencyHistogram, MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, NamedEndpoint,
     NetworkRefusal, OutputReaders, PartialSample, PatternRecord, ProbeRefusal, ProcessHealth,
     ProcessIdentity, PublisherAccount, RouteInfo, SubscriberRecord,
@@ -63,6 +63,7 @@ plain! {
     RouteInfo: 3 * 16 + 2 * 4 + 6,
     PatternRecord: 4 + 16,
     PartialSample: 11 + 16,
+    Backlog: 4 + 16,
     IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 5 + 3 + 2,
     LaneCounters: 6 + DropReason::COUNT + 8,
     OutputReaders: MAX_OUTPUT_READERS * (6 + 2) + MAX_UNMATCHED_READERS * 3 + 2,

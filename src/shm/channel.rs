@@ -30,6 +30,8 @@ pub(super) const LENT_SLOTS: usize = 2;
 /// the DDS library assembles samples.
 pub(super) const LOANED_SLOTS: usize = 1 + LENT_SLOTS;
 pub(super) const TAP: QueueLimits = QueueLimits { queue_depth: 4, max_borrowed: 2 };
+/// Samples that wait in the queue of ingress itself, which takes each one after it has published it.
+const BACKLOG_QUEUE: usize = 4;
 /// The most publishers of a route: ingress, and one for a future standby.
 const PUBLISHERS: usize = 2;
 /// Attempts to open a service whose creator has died or whose last user is removing it, and the pause between
@@ -69,6 +71,8 @@ pub struct RouteChannel {
     pub max_taps: usize,
     /// Samples that are retained for subscribers that join later.
     pub retained_samples: usize,
+    /// The most samples that ingress keeps in addition for a lane that restarts; 0 for none.
+    pub backlog_samples: usize,
 }
 
 /// The size of a page of memory: 4 KiB, or 16 or 64 KiB on some computers with arm64. A file in shared memory
@@ -89,9 +93,12 @@ const SLOT_ALIGN: usize = if align_of::<IceoryxHeader>() > align_of::<WireHeader
     align_of::<WireHeader>()
 };
 
+/// The bytes before the bridge's header of a slot.
+pub(super) const ICEORYX_HEADER_BYTES: usize =
+    size_of::<IceoryxHeader>().next_multiple_of(align_of::<WireHeader>());
+
 /// The bytes before the payload of a slot.
-pub(super) const SLOT_HEADER_BYTES: usize =
-    size_of::<IceoryxHeader>().next_multiple_of(align_of::<WireHeader>()) + size_of::<WireHeader>();
+pub(super) const SLOT_HEADER_BYTES: usize = ICEORYX_HEADER_BYTES + size_of::<WireHeader>();
 
 /// The size of the pool of a route.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -122,6 +129,7 @@ impl RouteChannel {
             lanes: settings.lanes.iter().filter(serves).map(QueueLimits::of).collect(),
             max_taps: settings.shared_memory.max_taps,
             retained_samples: configured.retained_samples,
+            backlog_samples: if settings.is_critical(route) { configured.backlog_samples } else { 0 },
         }
     }
 
@@ -130,10 +138,11 @@ impl RouteChannel {
     ///
     /// Every used slot is in the queue of a lane or tap, borrowed by one, retained, or loaned to ingress. All
     /// queues get each sample, and a full one loses its oldest: they hold the last samples, as many as the
-    /// deepest has room for, and so do the retained samples. So the sum of that number, of what may be
-    /// borrowed and of what may be loaned is enough, whatever the lanes do.
+    /// deepest has room for, and so do the retained samples and the backlog. So the sum of that number, of
+    /// what may be borrowed and of what may be loaned is enough, whatever the lanes do.
     pub fn pool_size(&self) -> PoolSize {
         let last = self.queues().map(|queue| self.depth(queue)).max().unwrap_or(self.retained_samples);
+        let last = last.max(self.backlog().map_or(0, |queue| queue.max_borrowed));
         let borrowed: usize = self.lanes.iter().map(|lane| lane.max_borrowed.max(1)).sum();
         let slots = last + borrowed + self.max_taps * TAP.max_borrowed + LOANED_SLOTS;
         let stride = (SLOT_HEADER_BYTES + self.max_sample_bytes).next_multiple_of(SLOT_ALIGN) as u64;
@@ -158,11 +167,21 @@ impl RouteChannel {
         self.lanes.iter().copied().chain((self.max_taps > 0).then_some(TAP))
     }
 
+    /// The queue of ingress itself, which takes each sample after it has published it.
+    pub(super) fn backlog(&self) -> Option<QueueLimits> {
+        (self.backlog_samples > 0).then_some(QueueLimits {
+            queue_depth: BACKLOG_QUEUE,
+            max_borrowed: self.backlog_samples + BACKLOG_QUEUE,
+        })
+    }
+
     /// All parameters as text. iceoryx2 refuses to open the service with another text.
     fn parameters(&self) -> String {
         let lanes = self.lanes.iter().map(|lane| format!(" {}+{}", lane.queue_depth, lane.max_borrowed));
-        let (bytes, taps, retained) = (self.max_sample_bytes, self.max_taps, self.retained_samples);
-        format!("bytes={bytes} taps={taps} retained={retained}{}", lanes.collect::<String>())
+        let (bytes, taps) = (self.max_sample_bytes, self.max_taps);
+        let (retained, backlog) = (self.retained_samples, self.backlog_samples);
+        let lanes = lanes.collect::<String>();
+        format!("bytes={bytes} taps={taps} retained={retained} backlog={backlog}{lanes}")
     }
 
     /// Opens the route's service; the first process creates it.
@@ -177,7 +196,9 @@ impl RouteChannel {
         let value = parameters.as_str().try_into().map_err(|error| failure(format!("{error:?}")))?;
         let verifier = AttributeVerifier::new().require(&key, &value);
         let verifier = verifier.map_err(|error| failure(format!("{error:?}")))?;
-        let subscribers = (self.lanes.len() + self.max_taps).max(1);
+        let backlog = self.backlog();
+        let queues = || self.queues().chain(backlog);
+        let subscribers = (self.lanes.len() + self.max_taps + usize::from(backlog.is_some())).max(1);
         let mut attempt = 0;
         loop {
             attempt += 1;
@@ -192,9 +213,9 @@ impl RouteChannel {
                 .max_subscribers(subscribers)
                 .max_nodes(subscribers + PUBLISHERS)
                 .history_size(self.retained_samples)
-                .subscriber_max_buffer_size(self.queues().map(|q| self.depth(q)).max().unwrap_or(1))
+                .subscriber_max_buffer_size(queues().map(|queue| self.depth(queue)).max().unwrap_or(1))
                 .subscriber_max_borrowed_samples(
-                    self.queues().map(|queue| queue.max_borrowed).max().unwrap_or(1).max(1),
+                    queues().map(|queue| queue.max_borrowed).max().unwrap_or(1).max(1),
                 )
                 .open_or_create_with_attributes(&verifier);
             let error = match opened {

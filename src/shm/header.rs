@@ -15,14 +15,20 @@ pub enum HeaderError {
     PayloadTooLong,
 }
 
-/// A [`SampleHeader`] as iceoryx2's user header.
+/// iceoryx2's user header: a [`SampleHeader`], and the length of the payload for processes that read the slot
+/// without a port of the channel.
 #[derive(Clone, Copy, Debug, Default)]
-#[repr(transparent)]
-pub(super) struct WireHeader(pub(super) SampleHeader);
+#[repr(C)]
+pub(super) struct WireHeader {
+    pub(super) sample: SampleHeader,
+    pub(super) payload_bytes: u64,
+}
 
 /// The header has no padding, so that every byte in shared memory is written.
 const _: () = assert!(
-    size_of::<SampleHeader>() == 8 + 8 + 8 + 8 + 8 + 16 + 4 + 4 + 24 && align_of::<SampleHeader>() == 8
+    size_of::<WireHeader>() == size_of::<SampleHeader>() + 8
+        && size_of::<SampleHeader>() == 8 + 8 + 8 + 8 + 8 + 16 + 4 + 4 + 24
+        && align_of::<SampleHeader>() == 8
 );
 
 // SAFETY: `SampleHeader` is `repr(C)`, of integers and byte arrays only: no pointer, no reference, no handle
@@ -30,6 +36,6 @@ const _: () = assert!(
 // name of the service contains the version.
 unsafe impl ZeroCopySend for WireHeader {
     unsafe fn type_name() -> &'static str {
-        "ab2::SampleHeader"
+        "ab3::SampleHeader"
     }
 }

@@ -3,6 +3,7 @@
 //! - [`ShmNode`]: the membership of a process in a bridge instance; cleans up after dead processes.
 //! - [`RouteChannel`], [`SamplePublisher`], [`SampleSubscriber`]: the samples of one route, in a pool of
 //!   slots (iceoryx2 publish-subscribe).
+//! - [`BacklogKeeper`]: samples that ingress keeps for a lane that restarts.
 //! - [`PoolBudget`]: the shared memory that the pools of all routes may take.
 //! - [`LaneWaker`], [`LaneSleeper`]: ingress wakes a lane.
 //! - [`Boards`]: latest values that readers poll without waiting: health, counters, latencies, policy.
@@ -13,6 +14,7 @@
 //! The public interface has no types of iceoryx2. Any process may be killed, stopped or restarted at any
 //! moment; `docs/decisions/0004-shared-memory.md` describes how each primitive tolerates that.
 
+mod backlog;
 mod board;
 mod budget;
 mod cell;
@@ -34,10 +36,13 @@ mod service;
 mod subscriber;
 mod wake;
 
+pub use backlog::{BacklogKeeper, read_backlog};
 pub use board::{
     BoardWriter, Boards, BridgeShape, HistogramWriter, Policies, ProcessRole, Stage, write_rows,
 };
-pub use budget::{DEFAULT_BUDGET_BYTES, NoMemory, PoolBudget, PoolUse, budget_bytes};
+pub use budget::{
+    DEFAULT_BUDGET_BYTES, NoMemory, PoolBudget, PoolUse, backlog_bytes, budget_bytes, most_backlog_bytes,
+};
 pub use channel::{OTHER_SHARED_BYTES, PoolSize, QueueLimits, RouteChannel};
 pub use error::ShmError;
 pub use header::HeaderError;

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use nix::sys::mman::{MapFlags, ProtFlags, mmap, munmap};
 
 use super::error::ShmError;
+use super::header::WireHeader;
 use super::root::SHM_DIR;
 
 /// A read-only mapping of a pool's file.
@@ -48,6 +49,22 @@ impl PoolView {
         let (offset, len) = (usize::try_from(offset).ok()?, usize::try_from(len).ok()?);
         let end = offset.checked_add(len)?;
         (end <= self.len).then(|| PoolPayload { view: self.clone(), offset, len })
+    }
+}
+
+/// A header or payload that another process may write meanwhile is copied before it is looked at.
+impl PoolView {
+    /// A copy of the header at that place; `None` if the pool does not contain it.
+    pub(super) fn copy_header(self: &Arc<Self>, offset: u64) -> Option<WireHeader> {
+        let header = self.payload(offset, size_of::<WireHeader>() as u64)?;
+        let start: *const WireHeader = header.as_ref().as_ptr().cast();
+        // SAFETY: the range is within the mapping, and every bit pattern is a valid header.
+        Some(unsafe { start.read_unaligned() })
+    }
+
+    /// A copy of the payload at that place; `None` if the pool does not contain it.
+    pub(super) fn copy_payload(self: &Arc<Self>, offset: u64, len: u64) -> Option<Box<[u8]>> {
+        self.payload(offset, len).map(|payload| payload.as_ref().into())
     }
 }
 

@@ -19,7 +19,7 @@ use super::header::WireHeader;
 use super::node::{NodeShared, ShmNode, StartLock};
 use super::segment::{free_bytes, no_room};
 use super::service::Service;
-use crate::model::{FixedText, MonotonicNs, SampleHeader};
+use crate::model::{Backlog, FixedText, MonotonicNs, SampleHeader};
 
 /// The free slots that are tried for a payload until one has the memory or gets it. A slot that was refused
 /// memory returns to the top of the free ones, so without further tries the next payload gets the same one,
@@ -137,6 +137,11 @@ impl SamplePublisher {
         self.max_sample_bytes
     }
 
+    /// Where the slots of the pool are, for a backlog of which no sample is kept yet.
+    pub(super) fn empty_backlog(&self) -> Backlog {
+        self.slots.empty_backlog()
+    }
+
     /// What the pool takes of the budget.
     pub fn memory(&self) -> PoolUse {
         self.slots.usage()
@@ -150,7 +155,7 @@ impl SamplePublisher {
         }
         self.slots.note_sample(payload.len());
         let (slot, permit) = self.loan(payload.len())?;
-        Ok(Slot { sample: slot.write_from_slice(payload), _permit: permit })
+        Ok(Slot { sample: slot.write_from_slice(payload), length: payload.len(), _permit: permit })
     }
 
     /// Takes a free slot with the memory for a payload of that length. Without memory for it, tries a few
@@ -212,7 +217,7 @@ impl SamplePublisher {
         // For an empty payload this is a dangling address.
         let payload = NonNull::from(payload).cast::<u8>();
         let place = self.slots.place(payload.as_ptr().addr());
-        let slot = Slot { sample, _permit: permit };
+        let slot = Slot { sample, length, _permit: permit };
         Some(LentSlot { payload, length, place, slot, _lent: lent, _node: self.node.clone() })
     }
 
@@ -255,6 +260,8 @@ fn address_of_first_slot(port: &Publisher<Service, [u8], WireHeader>) -> Option<
 #[derive(Debug)]
 pub struct Slot {
     sample: SampleMut<Service, [u8], WireHeader>,
+    /// The length of the payload, stored because iceoryx2 takes a lock for each access to it.
+    length: usize,
     // Declared after `sample`, so that the slot is free before the permit is returned.
     _permit: Permit,
 }
@@ -263,7 +270,7 @@ impl Slot {
     /// Publishes the payload and returns the number of subscribers that received it. Never waits: a full
     /// queue drops its oldest sample.
     pub fn publish(mut self, header: SampleHeader) -> Result<usize, PublishError> {
-        *self.sample.user_header_mut() = WireHeader(header);
+        *self.sample.user_header_mut() = WireHeader { sample: header, payload_bytes: self.length as u64 };
         self.sample.send().map_err(|_| PublishError)
     }
 }

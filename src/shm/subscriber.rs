@@ -137,7 +137,7 @@ impl SampleSubscriber {
                 return Err(TakeError::Failed("the publisher's memory cannot be mapped"));
             }
         };
-        let header = slot.user_header().0;
+        let header = slot.user_header().sample;
         // The address and the length are stored, so that a later access takes no lock and reads no length
         // that may have changed.
         let payload: *const [u8] = slot.payload();
@@ -152,7 +152,8 @@ impl SampleSubscriber {
         let Some(payload) = NonNull::new(payload.cast_mut().cast()) else {
             return Err(TakeError::Failed("a payload at address 0"));
         };
-        Ok(Some(ShmSample { header, payload, length, _slot: slot, _borrow: borrow }))
+        let kept = Kept::InSlot { _slot: slot, _borrow: borrow };
+        Ok(Some(ShmSample { header, payload, length, _kept: kept }))
     }
 
     /// The most samples that wait in the queue.
@@ -185,26 +186,43 @@ fn acquire_tap_lock(shared: &NodeShared, channel: &RouteChannel) -> Result<RoleL
     Err(ShmError::TooManySubscribers { route: channel.route.clone(), max: channel.max_taps })
 }
 
-/// A sample in shared memory. Dropping it, on any thread, frees its slot.
+/// A sample in shared memory, or a copy of one. Dropping it, on any thread, frees its slot.
 #[derive(Debug)]
 pub struct ShmSample {
     header: SampleHeader,
     payload: NonNull<u8>,
     length: usize,
-    // Declared before `_borrow`, so that the slot is returned before the count is decremented.
-    _slot: Sample<Service, [u8], WireHeader>,
-    _borrow: Borrow,
+    _kept: Kept,
+}
+
+/// What keeps the payload.
+#[derive(Debug)]
+enum Kept {
+    InSlot {
+        // Declared before `_borrow`, so that the slot is returned before the count is decremented.
+        _slot: Sample<Service, [u8], WireHeader>,
+        _borrow: Borrow,
+    },
+    Copied {
+        _bytes: Box<[u8]>,
+    },
 }
 
 // SAFETY: a shared reference gives access to the header, which is a copy, and to the bytes of the payload,
-// which no process writes while they are borrowed. `_slot`, the field that is not `Sync`, is not accessed
-// until it is dropped, and may be dropped on any thread: `Sample` of a thread-safe service is `Send`. The
-// bytes are in a mapping that `_slot` keeps, not in memory of a thread.
+// which no process writes while they are borrowed or copied. `_slot`, the field that is not `Sync`, is not
+// accessed until it is dropped, and may be dropped on any thread: `Sample` of a thread-safe service is
+// `Send`. The bytes are in a mapping that `_slot` keeps or in a copy, not in memory of a thread.
 unsafe impl Sync for ShmSample {}
 // SAFETY: as above; the pointer is the only field that is not `Send` by itself.
 unsafe impl Send for ShmSample {}
 
 impl ShmSample {
+    /// A copy of a sample whose slot may be reused.
+    pub(super) fn copied(header: SampleHeader, bytes: Box<[u8]>) -> Self {
+        let (payload, length) = (NonNull::from(&*bytes).cast(), bytes.len());
+        Self { header, payload, length, _kept: Kept::Copied { _bytes: bytes } }
+    }
+
     /// The header, which has been validated.
     pub fn header(&self) -> &SampleHeader {
         &self.header
@@ -213,7 +231,7 @@ impl ShmSample {
     /// The payload.
     pub fn payload(&self) -> &[u8] {
         // SAFETY: `length` bytes of the slot, which is mapped as long as `_slot` lives, and which ingress
-        // does not write before the slot is returned.
+        // does not write before the slot is returned; or of a copy, which lives as long as the sample.
         unsafe { std::slice::from_raw_parts(self.payload.as_ptr(), self.length) }
     }
 }
@@ -243,6 +261,7 @@ mod tests {
             lanes: vec![lane],
             max_taps: 0,
             retained_samples: 0,
+            backlog_samples: 0,
         };
         let publisher = SamplePublisher::create(&node, &channel).unwrap();
         let mut subscriber =
@@ -250,8 +269,7 @@ mod tests {
         // Processes with different sizes cannot open the same service. A faulty publisher is simulated by a
         // smaller limit at the subscriber.
         subscriber.max_sample_bytes = 50;
-        let mut header = WireHeader::default().0;
-        header.sequence = 1;
+        let header = SampleHeader { sequence: 1, ..SampleHeader::default() };
         for length in [51, 50] {
             publisher.copy_in(&vec![7; length]).unwrap().publish(header).unwrap();
         }

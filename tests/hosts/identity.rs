@@ -21,7 +21,7 @@ struct Seen {
 }
 
 /// Kills the critical lane under four subscribers, after each `pause`.
-fn kill(bed: &Bed, pause: Duration) -> Vec<Seen> {
+fn kill(bed: &Bed, rate_hz: f64, pause: Duration) -> Vec<Seen> {
     let subscribers = [
         ("Fast DDS, RELIABLE", Peer::fast().keep_all()),
         ("Fast DDS, BEST_EFFORT", Peer::fast().keep_all().best_effort()),
@@ -29,7 +29,7 @@ fn kill(bed: &Bed, pause: Duration) -> Vec<Seen> {
         ("Cyclone DDS, BEST_EFFORT", Peer::cyclone().keep_all().best_effort()),
     ]
     .map(|(name, peer)| (name, bed.subscribe("critical", peer, CRITICAL)));
-    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(RATE_HZ), INPUT);
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(rate_hz), INPUT);
     let all_receive = |more: u64| {
         let before = subscribers.each_ref().map(|(_, subscriber)| subscriber.received());
         for ((_, subscriber), before) in subscribers.iter().zip(before) {
@@ -67,7 +67,7 @@ fn subscribers_stay_matched_with_a_critical_lane_that_is_killed() {
     let _alone = support::exclusive();
     let Some(bed) = Bed::start(test, SCAN) else { return };
     // A process that was up for less than a second does not leave its identity if it took it over.
-    let subscribers = kill(&bed, Duration::from_millis(1_500));
+    let subscribers = kill(&bed, RATE_HZ, Duration::from_millis(1_500));
     let log = bed.up.log();
     let continued = log.lines().filter(|line| line.contains("identity") && line.contains("continued=true"));
     assert_eq!(continued.count(), KILLS, "{log}");
@@ -76,6 +76,24 @@ fn subscribers_stay_matched_with_a_critical_lane_that_is_killed() {
         received.assert_sound();
         // The next process sends the sample that was numbered and not sent when the lane was killed before it
         // has matched its subscribers. RELIABLE ones request it.
+        let most = if name.ends_with("BEST_EFFORT") { KILLS as u64 } else { 0 };
+        assert!(received.missing_count <= most, "{name}: {received:?}");
+    }
+    bed.end();
+}
+
+/// A lane that restarts needs what was published meanwhile, and what its readers may lack: more samples than
+/// the channel retains of a route whose samples may have 16 MiB, which is the default.
+#[test]
+fn subscribers_receive_all_of_a_route_that_allows_large_samples() {
+    let test = "subscribers_receive_all_of_a_route_that_allows_large_samples";
+    let _alone = support::exclusive();
+    let yaml = SCAN.replace(", max_sample_bytes: 65536", "");
+    assert_ne!(yaml, SCAN);
+    let Some(bed) = Bed::start(test, &yaml) else { return };
+    for Seen { name, matches, received } in kill(&bed, 2.0 * RATE_HZ, Duration::from_millis(1_500)) {
+        assert_eq!(matches, (1, 0), "{name}");
+        received.assert_sound();
         let most = if name.ends_with("BEST_EFFORT") { KILLS as u64 } else { 0 };
         assert!(received.missing_count <= most, "{name}: {received:?}");
     }

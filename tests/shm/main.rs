@@ -1,6 +1,7 @@
 //! The shared-memory module on real shared memory, with real processes that are killed, stopped and
 //! restarted.
 
+mod backlog;
 mod child;
 mod support;
 
@@ -146,6 +147,7 @@ fn routed(route: &str) -> RouteChannel {
         route: RouteId::try_from(route).unwrap(),
         lanes: vec![QueueLimits { queue_depth: 32, max_borrowed: 8 }; 3],
         retained_samples: 8,
+        backlog_samples: 0,
         ..channel(16 << 20)
     }
 }
@@ -159,15 +161,15 @@ fn no_memory(publisher: &SamplePublisher, length: usize) -> NoMemory {
 
 #[test]
 fn sixty_routes_of_scans_take_at_most_48_mib() {
-    // By default each retains so many if its samples may have 16 MiB, or 64 KiB.
-    sixty_scans(8, 16 << 20);
-    sixty_scans(136, 64 << 10);
+    // By default each retains and keeps so many if its samples may have 16 MiB, or 64 KiB.
+    sixty_scans(8, 136, 16 << 20);
+    sixty_scans(136, 0, 64 << 10);
 }
 
-fn sixty_scans(retained_samples: usize, max_sample_bytes: usize) {
+fn sixty_scans(retained_samples: usize, backlog_samples: usize, max_sample_bytes: usize) {
     let place = Place::new();
     let node = place.node();
-    let limits = |route| RouteChannel { retained_samples, max_sample_bytes, ..route };
+    let limits = |route| RouteChannel { retained_samples, backlog_samples, max_sample_bytes, ..route };
     let channels: Vec<_> = (0..60).map(|number| limits(routed(&format!("scan{number}")))).collect();
     let budget = PoolBudget::of_channels(&channels, 256 << 20);
     let routes: Vec<_> = (0..)

@@ -111,6 +111,7 @@ pub fn channel(max_sample_bytes: usize) -> RouteChannel {
         lanes: vec![LANE, LANE],
         max_taps: 2,
         retained_samples: 0,
+        backlog_samples: 0,
     }
 }
 

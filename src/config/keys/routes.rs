@@ -122,7 +122,9 @@ pub(super) const ROWS: &[Row] = &[
     .doc(
         "Samples retained in shared memory for a lane that restarts, which it then forwards, and which its \
          TRANSIENT_LOCAL writer offers to late joiners. A topic with several latched publishers, such as \
-         `/tf_static`, needs one for each.",
+         `/tf_static`, needs one for each. Without this key a critical lane that restarts also forwards earlier \
+         ones: up to 512, with more than 16 routes an equal share of 8192, as far as they fit 16 MiB and an equal \
+         share of 128 MiB or an eighth of `shared_memory.budget_bytes`.",
     ),
     restarts(qos!("reliability"), Choice(words::<Reliability>), "as above")
         .doc("RELIABILITY: whether lost samples are repaired."),

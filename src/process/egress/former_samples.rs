@@ -4,6 +4,8 @@
 //! are still in their slots, and the send log has their numbers. The process collects them before it has a
 //! writer: a writer without them would answer that they are gone.
 
+use bytes::Bytes;
+
 use crate::dds::FormerSample;
 use crate::model::MonotonicNs;
 use crate::shm::ShmSample;
@@ -52,6 +54,26 @@ impl FormerSamples {
         Some(self.logged[place].0)
     }
 
+    /// The sequence number in the route of the first sample that a reader may lack.
+    pub fn first_sequence(&self) -> u64 {
+        self.logged.first().map_or(u64::MAX, |(_, sequence)| *sequence)
+    }
+
+    /// Collects a sample if the former process has written it.
+    pub fn collect(
+        &mut self,
+        sample: ShmSample,
+        by_reference: bool,
+        payload: impl FnOnce(ShmSample) -> Bytes,
+    ) {
+        let header = *sample.header();
+        let Some(number) = self.number_of(header.sequence) else { return };
+        let payload = payload(sample);
+        let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
+        let sample = FormerSample { number, payload, encapsulation, timestamp };
+        self.collected.push(Collected { sequence: header.sequence, by_reference, sample });
+    }
+
     /// The sequence number in the route of the last sample that the former process has written.
     pub fn last_sequence(&self) -> u64 {
         self.logged.last().map_or(0, |(_, sequence)| *sequence)
@@ -83,8 +105,6 @@ impl FormerSamples {
 
 #[cfg(test)]
 mod tests {
-    use bytes::Bytes;
-
     use super::*;
     use crate::model::{Encapsulation, SourceTimestamp};
 

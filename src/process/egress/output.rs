@@ -5,6 +5,8 @@ mod catch_up;
 mod former;
 mod matching;
 
+use std::collections::VecDeque;
+
 use bytes::Bytes;
 use tracing::{error, warn};
 
@@ -78,8 +80,11 @@ pub(super) struct Output {
     record: Option<WriterRecord>,
     /// While samples of the former process are collected.
     former: Option<Box<FormerSamples>>,
-    /// A sample that was taken and is the next one.
-    next: Option<ShmSample>,
+    /// Samples that were taken, or copied from the backlog, and are the next ones.
+    next: VecDeque<ShmSample>,
+    /// Whether samples may wait that were published while no process served the lane: until one that is later
+    /// was taken and the queue was empty.
+    may_be_behind: bool,
     /// Whether samples wait in the queue until the former readers have matched.
     is_held: bool,
     /// The publisher of the last sample taken.
@@ -158,7 +163,8 @@ impl Output {
             former_readers,
             record,
             former: Some(Box::new(former_samples)),
-            next: None,
+            next: VecDeque::new(),
+            may_be_behind: lane.class() == TrafficClass::Critical,
             last_publisher: Guid::default(),
             unmatched: Vec::new(),
             started_at,
@@ -196,17 +202,30 @@ impl Output {
             return None;
         }
         loop {
-            let taken = self.next.take().map_or_else(|| self.subscriber.take(), |next| Ok(Some(next)));
+            let taken = self.next.pop_front().map_or_else(|| self.subscriber.take(), |next| Ok(Some(next)));
             let sample = match taken {
                 Ok(Some(sample)) => sample,
                 // The borrow limit loses nothing: the samples stay in the channel.
-                Ok(None) | Err(TakeError::BorrowLimit) => return None,
+                Ok(None) => {
+                    self.may_be_behind &= !self.caught_up;
+                    return None;
+                }
+                Err(TakeError::BorrowLimit) => return None,
                 Err(failure) => {
                     self.log_unusable(failure);
                     continue;
                 }
             };
             let sequence = sample.header().sequence;
+            let expected = self.tracker.last() + 1;
+            if self.may_be_behind && expected > 1 && expected < sequence {
+                let behind = self.backlog(expected..sequence);
+                if !behind.is_empty() {
+                    self.next.push_front(sample);
+                    behind.into_iter().rev().for_each(|sample| self.next.push_front(sample));
+                    continue;
+                }
+            }
             match self.tracker.record(sequence) {
                 SequenceOutcome::InOrder => {}
                 SequenceOutcome::AfterGap(missing) => self.count_missing(missing, sample.header()),

@@ -22,8 +22,8 @@ use crate::model::{
     Reliability, RouteInfo, SampleHeader, TopicName, TrafficClass,
 };
 use crate::shm::{
-    BoardWriter, HistogramWriter, LaneWaker, LoanError, NoMemory, PoolBudget, RouteChannel, SamplePublisher,
-    Stage,
+    BacklogKeeper, BoardWriter, HistogramWriter, LaneWaker, LoanError, NoMemory, PoolBudget, RouteChannel,
+    SamplePublisher, Stage, backlog_bytes,
 };
 
 /// Interval at which a route without a publisher logs that it waits.
@@ -89,6 +89,9 @@ impl Input {
     ) -> Result<Self, RoleError> {
         let route = settings.routes[index].clone();
         let channel = RouteChannel::of(settings, index);
+        let publisher = SamplePublisher::create_within(&role.node, &channel, budget, index)?;
+        let board = role.boards.backlog_writer(index);
+        let backlog = BacklogKeeper::open(&role.node, &channel, &publisher, backlog_bytes(settings), board)?;
         let mut counters = role.boards.ingress_writer(index);
         counters.update(|counters| counters.writers = 0);
         let publishers = Publishers::open(&role.boards, index, counters.get(), clock::monotonic());
@@ -106,7 +109,8 @@ impl Input {
             settled_type: None,
             source_changed: true,
             pool: PoolOwner::new(
-                SamplePublisher::create_within(&role.node, &channel, budget, index)?,
+                publisher,
+                backlog,
                 Some(ArrivalProgress::new(
                     role.boards.partial_writer(index),
                     critical_lanes(role, settings, index),
@@ -168,7 +172,8 @@ impl Input {
         match self.inbox.take_from_any() {
             TakePayload::Empty => Step::Empty,
             TakePayload::Sample(origin, payload, encapsulation) => {
-                self.publish(self.pool.fill(payload), encapsulation, &origin)
+                let filled = self.pool.fill(payload);
+                self.publish(filled, encapsulation, &origin)
             }
             TakePayload::Malformed => {
                 self.counters.update(|counters| {
@@ -178,6 +183,11 @@ impl Input {
                 Step::Discarded
             }
         }
+    }
+
+    /// Keeps the published sample for a lane that restarts. To be called when the lanes are awake.
+    pub fn keep_published(&mut self) {
+        self.pool.keep_published();
     }
 
     fn publish(&mut self, filled: Filled, encapsulation: Encapsulation, origin: &SampleOrigin) -> Step {

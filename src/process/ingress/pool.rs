@@ -11,7 +11,7 @@ use super::arrival_progress::{ArrivalProgress, SampleProgress};
 use super::source::kept_bytes;
 use crate::dds::{AssemblyLimits, LentMemory, PartialArrival, Payload, SampleMemory};
 use crate::model::MonotonicNs;
-use crate::shm::{LentSlot, LoanError, PoolUse, SamplePublisher, Slot};
+use crate::shm::{BacklogKeeper, LentSlot, LoanError, PoolUse, SamplePublisher, Slot};
 
 /// The pool, as the main thread and the DDS library share it.
 pub(super) struct Pool {
@@ -39,19 +39,25 @@ pub(super) const UNFINISHED_IN_ALL_BYTES: usize = 2 * UNFINISHED_BYTES;
 /// The pool, as the input of the route owns it.
 pub(super) struct PoolOwner {
     pool: Arc<Pool>,
+    /// `None` for a route without one.
+    backlog: Option<BacklogKeeper>,
     /// Slots that the DDS library has dropped, for the main thread to free.
     abandoned: Receiver<LentSlot>,
 }
 
 impl PoolOwner {
     /// Owns the pool of a route. `progress` tells the lanes of samples that arrive in parts.
-    pub fn new(publisher: SamplePublisher, progress: Option<ArrivalProgress>) -> Self {
+    pub fn new(
+        publisher: SamplePublisher,
+        backlog: Option<BacklogKeeper>,
+        progress: Option<ArrivalProgress>,
+    ) -> Self {
         let (sender, abandoned) = channel();
         let finished = Arc::new(Mutex::new(None));
         let progress = progress.map(Arc::new);
         let pool =
             Arc::new(Pool { publisher, connecting: Mutex::new(()), abandoned: sender, progress, finished });
-        Self { pool, abandoned }
+        Self { pool, backlog, abandoned }
     }
 
     /// The pool, for the DDS library to borrow slots from.
@@ -71,16 +77,31 @@ impl PoolOwner {
         self.pool.publisher.give_back_idle(now);
     }
 
+    /// Keeps the sample that was published last for a lane that restarts. To be called when the lanes are
+    /// awake, which need not wait for this.
+    pub fn keep_published(&mut self) {
+        if let Some(backlog) = &mut self.backlog {
+            backlog.keep_published();
+        }
+    }
+
     /// What the pool takes of the budget.
     pub fn memory(&self) -> PoolUse {
         self.pool.publisher.memory()
     }
 
     /// Returns the slot in which the DDS library assembled the payload, or copies the payload into a new one.
-    pub fn fill(&self, payload: Payload) -> Filled {
+    pub fn fill(&mut self, payload: Payload) -> Filled {
         match payload {
             Payload::Bytes(bytes) => {
-                Filled { slot: self.pool.publisher.copy_in(&bytes), bytes: bytes.len(), in_place: false }
+                let mut slot = self.pool.publisher.copy_in(&bytes);
+                // A sample that can be forwarded goes before those that a lane may lack when it restarts.
+                if let (Err(LoanError::NoMemory(_)), Some(backlog)) = (&slot, &mut self.backlog)
+                    && backlog.free_all()
+                {
+                    slot = self.pool.publisher.copy_in(&bytes);
+                }
+                Filled { slot, bytes: bytes.len(), in_place: false }
             }
             Payload::Lent(mut memory) => {
                 let assembled = memory.bytes().len();
@@ -227,13 +248,20 @@ mod tests {
         let node = ShmNode::open(root.path(), &InstanceName::try_from("pool").unwrap(), "test").unwrap();
         let lanes = vec![QueueLimits { queue_depth: 4, max_borrowed: 2 }];
         let route = RouteId::try_from("scan").unwrap();
-        let channel = RouteChannel { route, max_sample_bytes: 100, lanes, max_taps: 0, retained_samples: 0 };
-        (PoolOwner::new(SamplePublisher::create(&node, &channel).unwrap(), None), node, root)
+        let channel = RouteChannel {
+            route,
+            max_sample_bytes: 100,
+            lanes,
+            max_taps: 0,
+            retained_samples: 0,
+            backlog_samples: 0,
+        };
+        (PoolOwner::new(SamplePublisher::create(&node, &channel).unwrap(), None, None), node, root)
     }
 
     #[test]
     fn a_lent_slot_is_filled_or_freed_by_the_main_thread() {
-        let (owner, _node, _root) = owner();
+        let (mut owner, _node, _root) = owner();
         let lender = owner.lender();
         for _ in 0..10 {
             let mut memory = lender.lend(100).unwrap();
@@ -254,7 +282,7 @@ mod tests {
 
     #[test]
     fn a_sample_that_the_route_does_not_allow_is_discarded_and_its_size_is_known() {
-        let (owner, _node, _root) = owner();
+        let (mut owner, _node, _root) = owner();
         for len in [101, 4 << 30] {
             let mut memory = owner.lender().lend(len).unwrap();
             memory.write(len - 3, &[1; 3]);

@@ -142,7 +142,10 @@ impl Receiving {
             let mut left = SAMPLES_PER_TURN;
             while left > 0 {
                 match input.step() {
-                    Step::Published => self.wake(route),
+                    Step::Published => {
+                        self.wake(route);
+                        input.keep_published();
+                    }
                     Step::Discarded => {}
                     Step::Empty => break,
                 }

@@ -3,6 +3,7 @@
 //! The types hold, check and convert values and do nothing else. The terms are those of DDS, RTPS, ROS 2 and
 //! teletraffic engineering; each is defined at the type of that name.
 
+mod backlog;
 mod control;
 mod counts;
 mod drops;
@@ -23,6 +24,7 @@ mod time;
 mod topic_pattern;
 mod type_hash;
 
+pub use backlog::Backlog;
 pub use control::{
     AbsenceKind, AbsenceRecord, ControlRecord, IntruderRecord, MAX_ABSENCES, MAX_INTRUDERS,
     MAX_NAMED_ENDPOINTS, MAX_SUBSCRIBERS, NamedEndpoint, ParameterRequests, SubscriberRecord,

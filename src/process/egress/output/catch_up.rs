@@ -17,6 +17,9 @@ const CATCH_UP_MS: u64 = 10_000;
 /// The last samples of a route, which are forwarded however old they are: they may be its present state.
 const ANY_AGE_SAMPLES: u64 = 8;
 
+/// The samples before the next one that ingress still keeps while a lane may wait: 32 ms at 1 kHz.
+const KEPT_BEFORE: u64 = 32;
+
 impl Output {
     /// Whether samples wait in the queue until the former readers have matched.
     pub const fn is_held(&self) -> bool {
@@ -38,7 +41,7 @@ impl Output {
                     || (self.former_readers.may_hold(now) && self.lack_former(writer))
             });
         // The readers that have matched must not lose samples to the others.
-        self.is_held = waits && (self.counters.get().readers == 0 || !self.is_queue_nearly_full());
+        self.is_held = waits && (self.counters.get().readers == 0 || !self.are_samples_nearly_lost());
         self.is_held
     }
 
@@ -49,10 +52,15 @@ impl Output {
         self.unsent.len() > 0 && writer.matched_readers().any(lacks)
     }
 
-    fn is_queue_nearly_full(&self) -> bool {
+    /// Whether the queue is nearly full, and ingress keeps few samples before the next one either.
+    fn are_samples_nearly_lost(&self) -> bool {
         let last = self.boards.ingress(self.route).map_or(0, |ingress| ingress.published);
         let waiting = last.saturating_sub(self.tracker.last());
-        waiting >= self.subscriber.queue_depth() as u64 / 8 * 7
+        let is_kept = || {
+            let first = self.boards.backlog(self.route).map_or(0, |backlog| backlog.first_sequence);
+            first > 0 && first + KEPT_BEFORE <= self.tracker.last()
+        };
+        waiting >= self.subscriber.queue_depth() as u64 / 8 * 7 && !is_kept()
     }
 
     /// Whether a sample from before the start of this process is too old to be forwarded: its LIFESPAN has

@@ -1,16 +1,18 @@
 //! How an output continues that of a killed process: with its account and with the samples that readers may
 //! lack.
 
+use std::ops::Range;
+
 use bytes::Bytes;
+use tracing::warn;
 
 use super::super::arena::CopyArena;
-use super::super::former_samples::Collected;
 use super::super::unsent::{Forwarded, record_sequence};
 use super::Output;
 use crate::clock;
 use crate::dds::{FormerSample, Participant};
 use crate::model::{DropReason, MonotonicNs};
-use crate::shm::TakeError;
+use crate::shm::{ShmSample, TakeError, read_backlog};
 
 impl Output {
     /// Whether the output waits for samples of the former process.
@@ -44,24 +46,20 @@ impl Output {
                 }
             };
             let header = *sample.header();
-            let Some(number) = former.number_of(header.sequence) else {
-                if header.sequence > former.last_sequence().max(self.tracker.last()) {
-                    former.next = Some(sample);
-                    former.complete();
+            if former.collected.is_empty() {
+                // The channel retains fewer samples than the backlog has.
+                for earlier in self.backlog(former.first_sequence()..header.sequence) {
+                    former.collect(earlier, false, Bytes::from_owner);
                 }
+            }
+            if header.sequence > former.last_sequence().max(self.tracker.last()) {
+                former.next = Some(sample);
+                former.complete();
                 continue;
-            };
+            }
             let by_reference = self.may_pass_by_reference(sample.payload().len());
-            let payload = if by_reference { Bytes::from_owner(sample) } else { arena.copy(sample.payload()) };
-            former.collected.push(Collected {
-                sequence: header.sequence,
-                by_reference,
-                sample: FormerSample {
-                    number,
-                    payload,
-                    encapsulation: header.encapsulation,
-                    timestamp: header.source_timestamp,
-                },
+            former.collect(sample, by_reference, |sample| {
+                if by_reference { Bytes::from_owner(sample) } else { arena.copy(sample.payload()) }
             });
         }
         let is_complete = former.is_complete(now);
@@ -71,6 +69,14 @@ impl Output {
             // The type is not known, or the writer could not be created.
             self.close_former_account(false, now);
         }
+    }
+
+    /// Copies of the samples with these sequence numbers that ingress keeps for a lane that restarts.
+    pub(super) fn backlog(&self, wanted: Range<u64>) -> Vec<ShmSample> {
+        read_backlog(&self.boards, self.route, wanted).unwrap_or_else(|error| {
+            warn!(route = self.id, lane = self.lane, %error, "cannot read what ingress keeps of the route");
+            Vec::new()
+        })
     }
 
     /// Closes the account of the former process, and returns what the next writer offers of its samples:
@@ -123,7 +129,7 @@ impl Output {
             counters.readers = 0;
         });
         self.readers.set(self.former_readers.on_board(self.counters.get().forwarded));
-        self.next = former.next;
+        self.next.extend(former.next);
         former.collected.into_iter().map(|collected| collected.sample).collect()
     }
 }

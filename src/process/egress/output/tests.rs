@@ -1,5 +1,6 @@
 //! The account of an output, with real shared memory and a real DDS writer.
 
+mod catch_up;
 mod former;
 
 use super::*;

@@ -78,7 +78,7 @@ fn origin(writer: Guid, sequence: i64) -> SampleOrigin {
     SampleOrigin { source_timestamp: SourceTimestamp::NONE, writer, sequence, key: SampleKey::NONE }
 }
 
-fn filled(input: &Input) -> Filled {
+fn filled(input: &mut Input) -> Filled {
     input.pool.fill(Payload::Bytes(Bytes::from_static(&[7; 10])))
 }
 
@@ -103,7 +103,7 @@ fn each_sample_is_counted_by_what_became_of_it() {
     assert!(publish(&mut input, ONE, 1));
     assert!(!publish(&mut input, ONE, 1), "repeated");
     assert!(publish(&mut input, ONE, 5));
-    let in_place = Filled { in_place: true, ..filled(&input) };
+    let in_place = Filled { in_place: true, ..filled(&mut input) };
     input.publish(in_place, Encapsulation::CDR_LE, &origin(ONE, 6));
     let counters = host.counters();
     assert_eq!((counters.received, counters.received_bytes, counters.published), (3, 30, 3));
