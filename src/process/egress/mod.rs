@@ -276,7 +276,7 @@ impl Egress {
         if self.count_sent() {
             until = MonotonicNs(until.0.min(now.plus_ns(UNSENT_POLL_NS).0));
         }
-        if self.outputs.iter().any(|output| output.is_held() || output.collects_former()) {
+        if self.outputs.iter().any(|output| output.is_waiting() || output.collects_former()) {
             until = MonotonicNs(until.0.min(now.plus_ms(HOLD_POLL_MS).0));
         }
         let wait_ns = until.since(now);

@@ -85,6 +85,8 @@ pub(super) struct Output {
     /// Whether samples may wait that were published while no process served the lane: until one that is later
     /// was taken and the queue was empty.
     may_be_behind: bool,
+    /// Whether such samples wait until readers have acknowledged those before.
+    is_paced: bool,
     /// Whether samples wait in the queue until the former readers have matched.
     is_held: bool,
     /// The publisher of the last sample taken.
@@ -165,6 +167,7 @@ impl Output {
             former: Some(Box::new(former_samples)),
             next: VecDeque::new(),
             may_be_behind: lane.class() == TrafficClass::Critical,
+            is_paced: false,
             last_publisher: Guid::default(),
             unmatched: Vec::new(),
             started_at,
@@ -198,7 +201,10 @@ impl Output {
     /// because the new writer needs them for late joiners. After a restart, a critical lane takes none before
     /// its former readers have matched.
     pub fn take(&mut self) -> Option<ShmSample> {
-        if self.collects_former() || (self.is_held && self.is_still_held()) {
+        if self.collects_former()
+            || (self.is_held && self.is_still_held())
+            || (self.may_be_behind && self.is_to_be_paced())
+        {
             return None;
         }
         loop {

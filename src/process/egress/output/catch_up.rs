@@ -17,15 +17,14 @@ const CATCH_UP_MS: u64 = 10_000;
 /// The last samples of a route, which are forwarded however old they are: they may be its present state.
 const ANY_AGE_SAMPLES: u64 = 8;
 
+/// The most samples that a reader has not acknowledged when a lane that catches up sends another one. The
+/// sockets of a reader hold some 70 of 3 KB by default.
+const MOST_IN_FLIGHT: usize = 32;
+
 /// The samples before the next one that ingress still keeps while a lane may wait: 32 ms at 1 kHz.
 const KEPT_BEFORE: u64 = 32;
 
 impl Output {
-    /// Whether samples wait in the queue until the former readers have matched.
-    pub const fn is_held(&self) -> bool {
-        self.is_held
-    }
-
     /// Lets the samples go that wait for former readers.
     pub fn end_hold(&mut self) {
         self.is_held = false;
@@ -43,6 +42,24 @@ impl Output {
         // The readers that have matched must not lose samples to the others.
         self.is_held = waits && (self.counters.get().readers == 0 || !self.are_samples_nearly_lost());
         self.is_held
+    }
+
+    /// Whether samples that waited for this process wait until the library has sent the ones before, and the
+    /// readers have acknowledged them: all of them at once would overflow the sockets of the readers, and
+    /// leave the history of the writer before they are repaired.
+    pub(super) fn is_to_be_paced(&mut self) -> bool {
+        let is_behind =
+            |reader: ReaderRecord| reader.reliable == 1 && reader.unacknowledged >= MOST_IN_FLIGHT as u64;
+        let has_slow_reader = |writer: &RawWriter| writer.matched_readers().any(is_behind);
+        self.is_paced = self.history.is_none()
+            && self.former_readers.may_hold(clock::monotonic())
+            && (self.unsent.len() >= MOST_IN_FLIGHT || self.writer.as_ref().is_some_and(has_slow_reader));
+        self.is_paced
+    }
+
+    /// Whether samples wait for former readers, or for acknowledgements.
+    pub const fn is_waiting(&self) -> bool {
+        self.is_held || self.is_paced
     }
 
     /// Whether matched readers lack samples of the former process that are not counted yet. The library sends

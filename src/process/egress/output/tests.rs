@@ -551,10 +551,10 @@ fn samples_of_a_critical_lane_wait_for_the_former_readers() {
         // Far from its end, however long this test is held up.
         output.former_readers = FormerReaders::of(&board, clock::monotonic().plus_ms(60_000));
         host.publish_next(1);
-        assert_eq!((output.take().is_none(), output.is_held()), (holds, holds), "{yaml}");
+        assert_eq!((output.take().is_none(), output.is_held), (holds, holds), "{yaml}");
         if holds {
             output.former_readers.matched(former);
-            assert_eq!((output.take().unwrap().header().sequence, output.is_held()), (1, false));
+            assert_eq!((output.take().unwrap().header().sequence, output.is_held), (1, false));
             (output.former_readers, output.is_held) = (FormerReaders::of(&board, MonotonicNs(0)), true);
             host.publish_next(2);
             assert_eq!(output.take().unwrap().header().sequence, 2, "they have not matched in time");

@@ -46,3 +46,27 @@ fn a_restarted_critical_lane_takes_from_the_backlog_what_its_queue_has_lost() {
         assert_eq!(output.counters.get().drops.total(), 6);
     }
 }
+
+#[test]
+fn samples_that_waited_for_a_lane_wait_until_those_before_are_sent() {
+    let mut host = Host::start(158, CRITICAL, SCAN);
+    let mut output = host.open();
+    host.publish_next(1);
+    for number in 1..=32 {
+        output.unsent.push(unsent(number));
+    }
+    assert!(output.take().is_none() && output.is_waiting());
+    output.unsent.pop_sent(1);
+    assert_eq!(take_all(&mut output), [1]);
+    assert!(!output.is_waiting());
+    // Not for longer than former readers are waited for, and not once it has caught up.
+    output.unsent.push(unsent(33));
+    host.publish_next(2);
+    output.may_be_behind = true;
+    output.former_readers = FormerReaders::of(&OutputReaders::default(), MonotonicNs(0));
+    assert_eq!(take_all(&mut output), [2]);
+    output.former_readers = FormerReaders::of(&OutputReaders::default(), clock::monotonic());
+    host.publish_next(3);
+    assert!(!output.may_be_behind);
+    assert_eq!(take_all(&mut output), [3]);
+}
