@@ -315,6 +315,14 @@ impl Participant {
         }
     }
 
+    /// Tells other participants that a writer of the former process is gone, whose participant this one
+    /// continues. `key` is the part of its entity id that [`WriterContinuation::key`] gave.
+    pub fn dispose_former_writer(&self, key: [u8; 3]) {
+        if self.participant.dispose_former_writer(key).is_err() {
+            tracing::warn!(?key, "cannot announce that a writer of the former process is gone");
+        }
+    }
+
     /// Whether an endpoint belongs to this participant.
     pub fn owns(&self, endpoint: Guid) -> bool {
         endpoint.prefix() == self.guid().prefix()

@@ -55,13 +55,12 @@ pub(super) struct Identity {
 }
 
 impl Identity {
-    /// Opens the participant of the role `name`: that of the former process if `may_be_continued` and nothing
-    /// else speaks against it. Returns the identity to keep, and whether it is the former one.
+    /// Opens the participant of the role `name`: that of the former process if nothing speaks against it.
+    /// Returns the identity to keep, and whether it is the former one.
     pub fn join(
         role: &mut Role,
         process: ProcessRole,
         name: &str,
-        may_be_continued: bool,
         options: &ParticipantOptions,
         open: impl Fn(Kept) -> Result<Participant, DdsError>,
     ) -> Result<(Participant, Self, bool), RoleError> {
@@ -77,8 +76,7 @@ impl Identity {
         };
         let sockets = kept_sockets::inherited();
         let inherited = sockets.len();
-        let former = if may_be_continued { identity.former(role) } else { None };
-        let mut kept = Kept { former, sockets };
+        let mut kept = Kept { former: identity.former(role), sockets };
         let mut former = None;
         if kept.former.is_some() {
             identity.board.update(|board| {
@@ -172,16 +170,8 @@ impl Identity {
         self.board.set(board.sealed());
     }
 
-    /// Updates the board, and the journal if discovery has changed. `may_be_kept` is whether all endpoints
-    /// can be continued.
-    pub fn housekeeping(
-        &mut self,
-        participant: &Participant,
-        discovery_changed: bool,
-        may_be_kept: bool,
-        now: MonotonicNs,
-    ) {
-        self.is_kept &= may_be_kept;
+    /// Updates the board, and the journal if discovery has changed.
+    pub fn housekeeping(&mut self, participant: &Participant, discovery_changed: bool, now: MonotonicNs) {
         let unproven = if now < self.proven_at { self.board.get().unproven } else { 0 };
         self.record(participant, unproven);
         self.is_outdated |= discovery_changed;
@@ -195,7 +185,7 @@ impl Identity {
         self.journal_at = now.plus_ns(clock::monotonic().since(now) * JOURNAL_SHARE);
     }
 
-    /// The next process does not continue this one: it says goodbye, or announces what the next one cannot.
+    /// The next process does not continue this one, which says goodbye.
     pub fn end(&mut self) {
         if self.board.get().is_intact() {
             kept_sockets::forget();

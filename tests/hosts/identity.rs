@@ -100,6 +100,44 @@ fn subscribers_receive_all_of_a_route_that_allows_large_samples() {
     bed.end();
 }
 
+/// A latched output has another writer after a restart, which its subscribers match instead of the former
+/// one. The subscribers of the other output of the lane stay matched.
+#[test]
+fn an_output_that_is_not_continued_costs_the_others_nothing() {
+    let test = "an_output_that_is_not_continued_costs_the_others_nothing";
+    let _alone = support::exclusive();
+    let map = "  - id: map\n    input_topic: /map\n    message_type: sensor_msgs/msg/LaserScan\n    \
+               max_sample_bytes: 65536\n    \
+               qos_overrides: {critical: {durability: TRANSIENT_LOCAL, depth: 1}}\n";
+    let Some(bed) = Bed::start(test, &format!("{SCAN}{map}")) else { return };
+    let maps = [Peer::fast(), Peer::cyclone()].map(|peer| {
+        bed.subscribe("critical", peer.transient_local().keep_last(1), "rt/adaptive_bridge/critical/map")
+    });
+    let map = bed.publish(Peer::cyclone().transient_local().keep_last(1).count(1).linger_s(600.0), "rt/map");
+    maps.iter().for_each(|subscriber| subscriber.wait_received(1));
+    for Seen { name, matches, received } in kill(&bed, RATE_HZ, Duration::from_millis(1_500)) {
+        assert_eq!(matches, (1, 0), "{name}");
+        received.assert_sound();
+        let most = if name.ends_with("BEST_EFFORT") { KILLS as u64 } else { 0 };
+        assert!(received.missing_count <= most, "{name}: {received:?}");
+    }
+    for subscriber in maps {
+        let (matched, unmatched) = subscriber.matches();
+        assert_eq!((matched, unmatched), (KILLS + 1, KILLS), "a writer of a killed process is still matched");
+        // From each writer.
+        let received: Received = subscriber.end();
+        assert_eq!((received.received, received.duplicates), (1, KILLS as u64), "{received:?}");
+    }
+    // The last writer has the map.
+    for peer in [Peer::fast(), Peer::cyclone()] {
+        let topic = "rt/adaptive_bridge/critical/map";
+        let late = bed.subscribe("critical", peer.transient_local().keep_last(1), topic);
+        late.wait_received(1);
+    }
+    drop(map);
+    bed.end();
+}
+
 #[test]
 fn subscribers_may_come_and_go_while_no_lane_runs() {
     let test = "subscribers_may_come_and_go_while_no_lane_runs";

@@ -41,7 +41,6 @@ use crate::shm::{Boards, LaneSleeper, ProcessRole};
 use arena::CopyArena;
 use noncritical::Noncritical;
 use output::Output;
-use writer_record::may_be_kept;
 
 /// Samples that a critical lane takes from one route before it serves the next one, and the samples of higher
 /// priorities that it sends meanwhile. Both are limited, so that each route has its turn.
@@ -121,10 +120,8 @@ fn join(
     if lane.class() != TrafficClass::Critical {
         return Ok((role.join(options)?, None));
     }
-    let may_be_continued = may_be_kept(role, lane);
     let open = |kept| Participant::open_kept(options, kept);
-    let (participant, identity, continued) =
-        Identity::join(role, process, role_name, may_be_continued, options, open)?;
+    let (participant, identity, continued) = Identity::join(role, process, role_name, options, open)?;
     if !continued {
         role.dispose_former(&participant);
     }
@@ -317,8 +314,7 @@ impl Egress {
             }
         }
         if let Some(identity) = &mut self.identity {
-            let may_be_kept = self.outputs.iter().all(Output::may_be_continued);
-            identity.housekeeping(&self.participant, discovery_changed, may_be_kept, now);
+            identity.housekeeping(&self.participant, discovery_changed, now);
         }
         if let Some(lane) = &mut self.noncritical
             && self

@@ -119,7 +119,7 @@ impl Output {
         let boards = role.boards.clone();
         let counters = boards.lane_writer(lane_index, output.route);
         let readers = boards.output_readers_writer(lane_index, output.route);
-        let record = WriterRecord::of(role, participant, lane_index, output.route);
+        let record = WriterRecord::of(role, participant, lane_index, output);
         let logged = record.as_ref().map(WriterRecord::logged).unwrap_or_default();
         let started_at = clock::monotonic();
         let former_readers = FormerReaders::of(readers.get(), started_at);

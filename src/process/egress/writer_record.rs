@@ -5,22 +5,27 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::super::role::Role;
-use crate::config::Lane;
+use crate::config::Output;
 use crate::dds::{Participant, WriterContinuation};
 use crate::model::{DdsType, Durability, EndpointIdentity, Guid, QosProfile};
 use crate::shm::{BoardWriter, ProcessRole, SendLog};
 
-/// Whether the outputs of the lane are such that readers of the former process can be served as if nothing
-/// had happened: without a history, without keys, and not of a topic that ingress chooses.
-pub(super) fn may_be_kept(role: &Role, lane: &Lane) -> bool {
-    lane.outputs.iter().all(|output| {
-        let info = role.boards.route_info(output.route).unwrap_or_default();
-        let is_latched = output.latched_qos.is_some() && info.durability() == Durability::TransientLocal;
-        output.qos.durability == Durability::Volatile
-            && !is_latched
-            && info.has_keys == 0
-            && output.topic.resolve(None).is_some()
-    })
+/// Whether the output is such that readers of the former process can be served as if nothing had happened:
+/// without a history, without keys, and not of a topic that ingress chooses.
+fn may_be_continued(role: &Role, output: &Output) -> bool {
+    let info = role.boards.route_info(output.route).unwrap_or_default();
+    let is_latched = output.latched_qos.is_some() && info.durability() == Durability::TransientLocal;
+    output.qos.durability == Durability::Volatile
+        && !is_latched
+        && info.has_keys == 0
+        && output.topic.resolve(None).is_some()
+}
+
+/// The next writer of an output.
+pub(super) struct Next {
+    pub continuation: WriterContinuation,
+    /// The key of the former process' writer if readers still know that one, and this one is another.
+    pub superseded: Option<[u8; 3]>,
 }
 
 /// The identity of the DDS writer of one output.
@@ -30,21 +35,25 @@ pub(super) struct WriterRecord {
     route: usize,
     /// The sequence number in the route of the sample that is being written.
     writing: Arc<AtomicU64>,
-    /// Whether the next writer may be that of the former process: the participant is, and this process has
-    /// had no writer, which would have said goodbye.
+    /// Whether the participant is that of the former process, and this process has had no writer of the
+    /// output, which would have said goodbye.
+    is_first: bool,
+    /// Whether the next writer may be that of the former process.
     may_continue: bool,
 }
 
 impl WriterRecord {
     /// That of an output; `None` if the lane does not keep the identity of this participant.
-    pub fn of(role: &Role, participant: &Participant, lane: usize, route: usize) -> Option<Self> {
+    pub fn of(role: &Role, participant: &Participant, lane: usize, output: &Output) -> Option<Self> {
         let kept = role.boards.identity(ProcessRole::Egress(lane))?;
+        let is_first = role.former.participant == participant.guid();
         (kept.is_intact() && kept.participant == participant.guid()).then(|| Self {
-            board: role.boards.writer_identity_writer(lane, route),
-            log: role.boards.send_log(lane, route),
-            route,
+            board: role.boards.writer_identity_writer(lane, output.route),
+            log: role.boards.send_log(lane, output.route),
+            route: output.route,
             writing: Arc::default(),
-            may_continue: role.former.participant == participant.guid(),
+            is_first,
+            may_continue: is_first && may_be_continued(role, output),
         })
     }
 
@@ -61,7 +70,8 @@ impl WriterRecord {
 
     fn is_continuable(&self) -> bool {
         let former = self.board.get();
-        self.may_continue
+        self.is_first
+            && self.may_continue
             && former.is_intact()
             && former.count > 0
             && (0..i64::MAX / 2).contains(&self.log.highest())
@@ -69,19 +79,15 @@ impl WriterRecord {
 
     /// How the next writer begins: where that of the former process ended, with its last samples, if it is
     /// the first one, of the same participant, and offers the same; else without them.
-    pub fn next(
-        &mut self,
-        participant: Guid,
-        topic: &str,
-        dds_type: &DdsType,
-        qos: &QosProfile,
-    ) -> WriterContinuation {
+    pub fn next(&mut self, participant: Guid, topic: &str, dds_type: &DdsType, qos: &QosProfile) -> Next {
         let mut hasher = DefaultHasher::new();
         (participant, topic, dds_type.name, dds_type.has_keys, qos).hash(&mut hasher);
         let offer = hasher.finish();
         let former = *self.board.get();
         let is_former = self.is_continuable() && former.offer == offer;
-        self.may_continue = false;
+        let was_announced = self.is_first && former.is_intact() && former.offer != 0;
+        let superseded = (was_announced && !is_former).then(|| key(self.route, former.count));
+        self.is_first = false;
         if !is_former {
             // In this order: no number goes with the wrong writer if the process dies in between.
             self.board.set(EndpointIdentity::default());
@@ -90,7 +96,7 @@ impl WriterRecord {
             self.board.set(EndpointIdentity { count, offer, ..EndpointIdentity::default() }.sealed());
         }
         let (log, writing) = (self.log.clone(), self.writing.clone());
-        WriterContinuation {
+        let continuation = WriterContinuation {
             key: key(self.route, self.board.get().count),
             highest_number: self.log.highest(),
             samples: Vec::new(),
@@ -100,7 +106,8 @@ impl WriterRecord {
                 let sequence = if is_written { writing.load(Ordering::Relaxed) } else { 0 };
                 log.record(number, sequence);
             }),
-        }
+        };
+        Next { continuation, superseded }
     }
 
     /// The writer says goodbye.

@@ -146,7 +146,7 @@ impl Ingress {
             Participant::open_receiving(&options, kept, unfinished, urgent_topics(), on_arriving, on_received)
         };
         let (participant, identity, continued) =
-            Identity::join(&mut role, ProcessRole::Ingress, "ingress", true, &options, open)?;
+            Identity::join(&mut role, ProcessRole::Ingress, "ingress", &options, open)?;
         let resume_until = clock::monotonic().plus_ms(RESUME_MS);
         let hold_until = continued.then(|| clock::monotonic().plus_ms(HOLD_MS));
         let patterns = Patterns::open(settings, &role.boards);
@@ -221,7 +221,7 @@ impl Ingress {
             self.hold_until = None;
             self.participant.receive_samples();
         }
-        self.identity.housekeeping(&self.participant, discovery_changed, true, now);
+        self.identity.housekeeping(&self.participant, discovery_changed, now);
         // Not earlier: a publisher releases samples that every matched reader has acknowledged, and the
         // readers of this process have not requested them yet.
         if resumed && !std::mem::replace(&mut self.has_resumed, true) {

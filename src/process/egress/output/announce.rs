@@ -7,17 +7,13 @@ use super::super::former_readers::FormerReaders;
 use super::super::offer::Offer;
 use super::super::overrun::Overrun;
 use super::super::unsent::UnsentSamples;
+use super::super::writer_record::Next;
 use super::Output;
 use crate::clock;
 use crate::dds::{Participant, RawWriter};
 use crate::model::{DdsType, DropReason, Durability, Guid};
 
 impl Output {
-    /// Whether the readers of its writer can be served by the next process as if nothing had happened.
-    pub fn may_be_continued(&self) -> bool {
-        self.offer.qos.durability == Durability::Volatile && !self.has_keys && !self.topic.is_place
-    }
-
     /// Whether the publishers offer TRANSIENT_LOCAL and the output does not, though it follows them.
     pub(super) fn is_to_latch(&self) -> bool {
         self.durability.get() == Durability::TransientLocal && self.latched_offer.is_some()
@@ -149,7 +145,10 @@ impl Output {
             .map(|record| record.next(participant.guid(), &self.topic.dds_topic, &dds_type, &qos));
         let writer = match continuation {
             None => participant.create_writer(&self.topic.dds_topic, dds_type, &qos, window_samples)?,
-            Some(mut continuation) => {
+            Some(Next { mut continuation, superseded }) => {
+                if let Some(key) = superseded {
+                    participant.dispose_former_writer(key);
+                }
                 let is_continued = continuation.highest_number > 0;
                 if !is_continued {
                     self.counters.update(|counters| counters.accounted_number = 0);

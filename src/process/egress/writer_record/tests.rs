@@ -16,6 +16,7 @@ fn record(role: &Role) -> WriterRecord {
         log: role.boards.send_log(LANE, 0),
         route: 0,
         writing: Arc::default(),
+        is_first: true,
         may_continue: true,
     }
 }
@@ -26,8 +27,9 @@ fn a_writer_continues_the_numbers_of_the_former_process_if_it_is_the_same_writer
     let (ours, others) = (Guid([1; 16]), Guid([2; 16]));
     let (qos, other_qos) =
         (QosProfile::CRITICAL, QosProfile { deadline_ms: Some(5), ..QosProfile::CRITICAL });
-    let next =
-        |record: &mut WriterRecord, participant, topic, qos| record.next(participant, topic, &DDS_TYPE, qos);
+    let next = |record: &mut WriterRecord, participant, topic, qos| {
+        record.next(participant, topic, &DDS_TYPE, qos).continuation
+    };
 
     let first = next(&mut record(&role), ours, "rt/a", &qos);
     assert_eq!(first.highest_number, 0);
@@ -70,11 +72,39 @@ fn a_writer_continues_the_numbers_of_the_former_process_if_it_is_the_same_writer
 }
 
 #[test]
+fn readers_are_told_of_a_writer_that_is_not_continued() {
+    let (role, settings, _folder) = test_role::open(ProcessRole::Egress(LANE), "egress", 75, SCAN);
+    let ours = Guid([1; 16]);
+    let next = |mut record: WriterRecord, qos| record.next(ours, "rt/a", &DDS_TYPE, qos);
+    let (qos, other) = (QosProfile::CRITICAL, QosProfile { deadline_ms: Some(5), ..QosProfile::CRITICAL });
+    let first = next(record(&role), &qos);
+    assert_eq!((first.superseded, next(record(&role), &qos).superseded), (None, None));
+    let second = next(record(&role), &other);
+    assert_eq!(second.superseded, Some(first.continuation.key));
+    // An output whose writers are never continued.
+    let third = next(WriterRecord { may_continue: false, ..record(&role) }, &other);
+    assert_eq!((third.superseded, third.continuation.highest_number), (Some(second.continuation.key), 0));
+    // Those of another participant are gone with that one; and one has said goodbye itself.
+    assert_eq!(next(WriterRecord { is_first: false, ..record(&role) }, &qos).superseded, None);
+    let mut process = record(&role);
+    process.next(ours, "rt/a", &DDS_TYPE, &qos);
+    process.removed();
+    assert_eq!(next(record(&role), &qos).superseded, None);
+
+    let output = &settings.lanes[LANE].outputs[0];
+    assert!(may_be_continued(&role, output));
+    let latched = QosProfile { durability: Durability::TransientLocal, ..output.qos };
+    assert!(!may_be_continued(&role, &Output { qos: latched, ..output.clone() }));
+    role.boards.route_info_writer(0).update(|info| info.has_keys = 1);
+    assert!(!may_be_continued(&role, output));
+}
+
+#[test]
 fn the_log_has_the_last_samples_that_were_written() {
     let (role, ..) = test_role::open(ProcessRole::Egress(LANE), "egress", 73, SCAN);
     let log = role.boards.send_log(LANE, 0);
     let mut process = record(&role);
-    let writer = process.next(Guid([1; 16]), "rt/a", &DDS_TYPE, &QosProfile::CRITICAL);
+    let writer = process.next(Guid([1; 16]), "rt/a", &DDS_TYPE, &QosProfile::CRITICAL).continuation;
     for number in 1..=300 {
         process.writing(number as u64 * 2);
         // Of each tenth number only the beginning was sent.
@@ -107,5 +137,5 @@ fn a_noncritical_lane_keeps_no_identity() {
     let (participant, identity) =
         join(&mut role, &settings.lanes[1], ProcessRole::Egress(1), "egress-noncritical", &options).unwrap();
     assert!(identity.is_none());
-    assert!(WriterRecord::of(&role, &participant, 1, 0).is_none());
+    assert!(WriterRecord::of(&role, &participant, 1, &settings.lanes[1].outputs[0]).is_none());
 }

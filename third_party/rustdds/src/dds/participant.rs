@@ -867,6 +867,16 @@ impl DomainParticipant {
     self.dpi.lock()?.dispose_participant(guid)
   }
 
+  /// Says goodbye on behalf of a writer of a former process, if this participant
+  /// [continues](DomainParticipantBuilder::continuing) that one's and has no writer with
+  /// that key. Whether its topic had keys may not be known any more.
+  pub fn dispose_former_writer(&self, entity_key: [u8; 3]) -> WriteResult<(), ()> {
+    let dpi = self.dpi.lock()?;
+    // Others ignore the goodbye of a writer that they do not know.
+    dpi.dispose_writer(EntityId::new(entity_key, EntityKind::WRITER_NO_KEY_USER_DEFINED))?;
+    dpi.dispose_writer(EntityId::new(entity_key, EntityKind::WRITER_WITH_KEY_USER_DEFINED))
+  }
+
   /// Readers of the topic that are made from now on begin after these samples of
   /// these writers: for an application that has taken them before, in this process
   /// or in an earlier one.
@@ -1419,6 +1429,14 @@ impl DomainParticipantDisc {
     self
       .discovery_command_sender
       .send(DiscoveryCommand::DisposeParticipant { guid })
+      .map_err(|_e| WriteError::WouldBlock { data: () })
+  }
+
+  pub(crate) fn dispose_writer(&self, entity_id: EntityId) -> WriteResult<(), ()> {
+    let guid = GUID::new(self.guid().prefix, entity_id);
+    self
+      .discovery_command_sender
+      .send(DiscoveryCommand::RemoveLocalWriter { guid })
       .map_err(|_e| WriteError::WouldBlock { data: () })
   }
 
