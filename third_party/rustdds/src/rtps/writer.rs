@@ -347,8 +347,9 @@ impl Writer {
     // TODO: Configuration value
     let cache_cleaning_period = Duration::from_secs(6);
 
-    // Start periodic Heartbeat
-    if let Some(period) = heartbeat_period {
+    // Start periodic Heartbeat. The first one soon: a writer that continues one of a former
+    // process begins with samples that its readers may lack.
+    if let Some(period) = heartbeat_period_fast {
       timed_event_timer.borrow_mut().set_timeout(
         std::time::Duration::from(period),
         DpTimerEvent::Writer {
