@@ -17,10 +17,6 @@ const CATCH_UP_MS: u64 = 10_000;
 /// The last samples of a route, which are forwarded however old they are: they may be its present state.
 const ANY_AGE_SAMPLES: u64 = 8;
 
-/// The most samples that a reader has not acknowledged when a lane that catches up sends another one. The
-/// sockets of a reader hold some 70 of 3 KB by default.
-const MOST_IN_FLIGHT: usize = 32;
-
 /// The samples before the next one that ingress still keeps while a lane may wait: 32 ms at 1 kHz.
 const KEPT_BEFORE: u64 = 32;
 
@@ -48,12 +44,13 @@ impl Output {
     /// readers have acknowledged them: all of them at once would overflow the sockets of the readers, and
     /// leave the history of the writer before they are repaired.
     pub(super) fn is_to_be_paced(&mut self) -> bool {
-        let is_behind =
-            |reader: ReaderRecord| reader.reliable == 1 && reader.unacknowledged >= MOST_IN_FLIGHT as u64;
+        // The writer retains twice as many.
+        let most = self.offer.window_samples.div_ceil(2);
+        let is_behind = |reader: ReaderRecord| reader.reliable == 1 && reader.unacknowledged >= most as u64;
         let has_slow_reader = |writer: &RawWriter| writer.matched_readers().any(is_behind);
         self.is_paced = self.history.is_none()
             && self.former_readers.may_hold(clock::monotonic())
-            && (self.unsent.len() >= MOST_IN_FLIGHT || self.writer.as_ref().is_some_and(has_slow_reader));
+            && (self.unsent.len() >= most || self.writer.as_ref().is_some_and(has_slow_reader));
         self.is_paced
     }
 

@@ -52,7 +52,8 @@ fn samples_that_waited_for_a_lane_wait_until_those_before_are_sent() {
     let mut host = Host::start(158, CRITICAL, SCAN);
     let mut output = host.open();
     host.publish_next(1);
-    for number in 1..=32 {
+    let most = output.offer.window_samples as i64 / 2;
+    for number in 1..=most {
         output.unsent.push(unsent(number));
     }
     assert!(output.take().is_none() && output.is_waiting());
@@ -60,7 +61,7 @@ fn samples_that_waited_for_a_lane_wait_until_those_before_are_sent() {
     assert_eq!(take_all(&mut output), [1]);
     assert!(!output.is_waiting());
     // Not for longer than former readers are waited for, and not once it has caught up.
-    output.unsent.push(unsent(33));
+    output.unsent.push(unsent(most + 1));
     host.publish_next(2);
     output.may_be_behind = true;
     output.former_readers = FormerReaders::of(&OutputReaders::default(), MonotonicNs(0));
