@@ -10,7 +10,7 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{Ordering, fence};
 
-use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 use iceoryx2::sample::Sample;
 
 use super::board::{BoardWriter, Boards};
@@ -64,11 +64,20 @@ impl BacklogKeeper {
         let what = format!("the backlog of route {}", channel.route);
         shared.require_free(0, &what)?;
         let create = || factory.subscriber_builder().buffer_size(channel.depth(queue)).create();
-        let port = create()
-            .map_err(|error| ShmError::failed(format!("to create {what}"), shared.folder(), error))?;
+        let port = match create() {
+            // A dead former process counts until it is cleaned up.
+            Err(SubscriberCreateError::ExceedsMaxSupportedSubscribers) => {
+                shared.clean_up(&start);
+                create()
+            }
+            other => other,
+        };
+        let port =
+            port.map_err(|error| ShmError::failed(format!("to create {what}"), shared.folder(), error))?;
         shared.commit(&what)?;
         Ok(Some(Self {
-            kept: VecDeque::new(),
+            // No sample of a steady flow allocates.
+            kept: VecDeque::with_capacity(channel.backlog_samples + 1),
             port,
             _node: shared.clone(),
             bytes: 0,
