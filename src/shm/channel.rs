@@ -93,6 +93,9 @@ const SLOT_ALIGN: usize = if align_of::<IceoryxHeader>() > align_of::<WireHeader
     align_of::<WireHeader>()
 };
 
+/// The bytes that iceoryx2 needs of a pool for its own description, rounded up: it takes some 150.
+const SEGMENT_BYTES: u64 = 256;
+
 /// The bytes before the bridge's header of a slot.
 pub(super) const ICEORYX_HEADER_BYTES: usize =
     size_of::<IceoryxHeader>().next_multiple_of(align_of::<WireHeader>());
@@ -149,9 +152,10 @@ impl RouteChannel {
         let is_sparse = stride > page_bytes();
         // Each slot begins at the same place of a page, so that its header is on one page.
         let stride_bytes = if is_sparse { stride.next_multiple_of(page_bytes()) } else { stride };
-        // In addition, a free list of 4 bytes for each slot, and the description of the segment.
-        let of_slots =
-            |slot_bytes: u64| (slots as u64 * (slot_bytes + 4) + 1024).next_multiple_of(page_bytes());
+        // In addition, a free list of 4 bytes for each slot.
+        let of_slots = |slot_bytes: u64| {
+            (slots as u64 * (slot_bytes + 4) + SEGMENT_BYTES).next_multiple_of(page_bytes())
+        };
         let bytes = of_slots(stride_bytes);
         let first_bytes = if is_sparse { of_slots(page_bytes()) } else { bytes };
         PoolSize { slots, stride_bytes, is_sparse, first_bytes, bytes }
