@@ -273,11 +273,9 @@ fn what_a_killed_critical_egress_had_not_repaired_the_next_process_repairs() {
 #[test]
 fn samples_that_a_killed_critical_egress_had_not_repaired_are_counted_as_unconfirmed() {
     let test = "samples_that_a_killed_critical_egress_had_not_repaired_are_counted_as_unconfirmed";
-    // A lane with a latched output is another participant after a kill, which can't repair what counts as
-    // forwarded.
-    let yaml = format!(
-        "{SCAN}  - {{id: map, input_topic: /map, qos_overrides: {{critical: {{durability: TRANSIENT_LOCAL}}}}}}\n"
-    );
+    // A latched output has another writer after a kill, which can't repair what counts as forwarded.
+    let latched = "qos_overrides: {critical: {durability: TRANSIENT_LOCAL, depth: 1}}}";
+    let yaml = SCAN.replace('}', &format!(", {latched}"));
     let Some((missed, dropped, unconfirmed)) = kill_during_an_outage(test, &yaml) else { return };
     let account = format!("missed {missed:?}, dropped {dropped}, unconfirmed {unconfirmed}");
     assert!(missed.into_iter().all(|missed| missed <= dropped + unconfirmed), "{account}");
