@@ -310,15 +310,17 @@ fn a_stopped_critical_subscriber_costs_the_others_no_sample_and_its_overrun_is_c
     }
     let received: Received = stopped.end();
     received.assert_sound();
-    let overruns: Vec<u64> = critical["matched_readers"]
-        .as_array()
-        .unwrap()
-        .iter()
-        .map(|reader| reader["overrun"].as_u64().unwrap())
-        .filter(|overrun| *overrun > 0)
-        .collect();
-    assert_eq!(overruns, [received.missing_count], "{critical}\n{received:?}");
-    assert_eq!(critical["reader_overrun"], received.missing_count, "{critical}");
+    let readers = critical["matched_readers"].as_array().unwrap().iter();
+    let overruns = readers.map(|reader| reader["overrun"].as_u64().unwrap()).filter(|overrun| *overrun > 0);
+    let overruns: Vec<u64> = overruns.collect();
+    // A sample that left the history after it was sent and before it was acknowledged counts, too: at most a
+    // history of them, which is twice the window.
+    let missing = received.missing_count;
+    assert!(
+        matches!(overruns[..], [one] if (missing..=missing + 128).contains(&one)),
+        "{critical}\n{received:?}"
+    );
+    assert_eq!(critical["reader_overrun"], overruns[0], "{critical}");
     bed.end();
 }
 
