@@ -9,8 +9,9 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 
 use tracing::{info, warn};
 
+use super::error::RoleError;
 use super::kept_sockets;
-use super::role::{Role, RoleError};
+use super::role::Role;
 use crate::clock;
 use crate::dds::{DdsError, Kept, Participant, ParticipantIdentity, ParticipantOptions, host_addresses};
 use crate::model::{Guid, MonotonicNs, ProcessHealth, ProcessIdentity};

@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-use super::role::{RoleError, lane_index};
+use super::error::RoleError;
+use super::role::lane_index;
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{LaneMode, LanePolicy, MonotonicNs};

@@ -9,9 +9,9 @@ use tracing::{debug, info, warn};
 
 use super::HOUSEKEEPING_MS;
 use super::count_log::RefusalLog;
+use super::error::RoleError;
 use super::notify::{Meter, Notifier};
 use super::probes::{PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, RequestHandler, Trust};
-use super::role::RoleError;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::DdsNetwork;

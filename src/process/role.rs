@@ -3,49 +3,17 @@
 
 use tracing::info;
 
+use super::error::RoleError;
 use super::notify::Notifier;
 use super::parameter_store::ParameterStore;
 use super::reload::{ReloadRequests, Reloads};
 use super::scheduling;
 use crate::clock;
 use crate::config::{Configuration, DdsNetwork, Scheduling, Settings};
-use crate::dds::{DdsError, Participant, ParticipantOptions};
+use crate::dds::{Participant, ParticipantOptions};
 use crate::model::{MonotonicNs, NetworkRefusals, ProcessHealth};
 use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, root_of};
 use crate::telemetry;
-
-/// Why a process could not start, or had to end.
-#[derive(Debug, thiserror::Error)]
-pub enum RoleError {
-    /// The configuration has no lane of that name.
-    #[error("there is no lane {name}; the configuration has: {}", .lanes.join(", "))]
-    NoSuchLane {
-        /// The name.
-        name: String,
-        /// The lanes that the configuration has.
-        lanes: Vec<String>,
-    },
-    /// No process serves the lane.
-    #[error(
-        "no process serves lane {lane} of instance {instance}; start it with \
-         `adaptive-bridge egress --lane {lane}` or `adaptive-bridge up`"
-    )]
-    NotRunning {
-        /// The instance.
-        instance: String,
-        /// The lane.
-        lane: String,
-    },
-    /// Shared memory failed.
-    #[error(transparent)]
-    Shm(#[from] ShmError),
-    /// DDS failed.
-    #[error(transparent)]
-    Dds(#[from] DdsError),
-    /// Another operating system call failed.
-    #[error(transparent)]
-    Os(#[from] std::io::Error),
-}
 
 pub(super) fn lane_index(settings: &Settings, name: &str) -> Result<usize, RoleError> {
     settings.lanes.iter().position(|lane| lane.name.as_str() == name).ok_or_else(|| RoleError::NoSuchLane {

@@ -11,7 +11,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use tracing::{debug, error, warn};
 
-use super::super::role::RoleError;
+use super::super::error::RoleError;
 use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Participant, RawWriter};

@@ -7,7 +7,7 @@ use std::rc::Rc;
 
 use tracing::{info, warn};
 
-use super::super::role::RoleError;
+use super::super::error::RoleError;
 use super::absences::Absences;
 use super::networks;
 use crate::config::{InputTopic, Lane, NeverInputs, OutputTopic, RoutePattern, Settings};

@@ -2,10 +2,10 @@
 
 use std::collections::VecDeque;
 
+use super::super::error::RoleError;
 use super::super::probes::{
     PROBE_READER_QOS, PROBE_TYPE, PROBE_WRITER_QOS, ProbeId, ProbeRequest, ProbeResponse, Trust,
 };
-use super::super::role::RoleError;
 use crate::clock;
 use crate::config::Settings;
 use crate::dds::{Inbox, Participant, RawWriter, ReaderQos, TakePayload};

@@ -19,11 +19,12 @@ use tracing::{error, info};
 
 use super::HOUSEKEEPING_MS;
 use super::count_log::RefusalLog;
+use super::error::RoleError;
 use super::memory_limit;
 use super::notify::write_list;
 use super::probes::Trust;
 use super::reload::ReloadRequests;
-use super::role::{Role, RoleError, participant_options};
+use super::role::{Role, participant_options};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{Configuration, DdsNetwork, InlineSecret, Settings};

@@ -26,11 +26,12 @@ use std::time::Duration;
 use tracing::{info, warn};
 
 use super::HOUSEKEEPING_MS;
+use super::error::RoleError;
 use super::identity::Identity;
 use super::memory_limit;
 use super::notify::{Meter, Notifier, write_drops, write_list};
 use super::reload::ReloadRequests;
-use super::role::{Role, RoleError, lane_index, participant_options};
+use super::role::{Role, lane_index, participant_options};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{self, Configuration, Forwarding, Lane, Settings};

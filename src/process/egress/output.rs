@@ -11,7 +11,8 @@ use bytes::Bytes;
 use tracing::{error, warn};
 
 use super::super::count_log::DropLog;
-use super::super::role::{Role, RoleError};
+use super::super::error::RoleError;
+use super::super::role::Role;
 use super::arena::CopyArena;
 use super::bound_topic::BoundTopic;
 use super::early_send::{EarlySend, Followed};

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use tracing::warn;
 
-use super::super::role::RoleError;
+use super::super::error::RoleError;
 use super::super::scheduling;
 use super::receiving::Receiving;
 use crate::config::Settings;

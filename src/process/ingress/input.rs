@@ -6,7 +6,8 @@ use std::sync::Arc;
 use tracing::{error, info, warn};
 
 use super::super::count_log::DropLog;
-use super::super::role::{Role, RoleError};
+use super::super::error::RoleError;
+use super::super::role::Role;
 use super::arrival_progress::ArrivalProgress;
 use super::pool::{Filled, PoolOwner};
 use super::publishers::{Publishers, SequenceCheck};

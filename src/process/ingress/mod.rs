@@ -21,11 +21,12 @@ use std::time::Duration;
 use tracing::info;
 
 use super::HOUSEKEEPING_MS;
+use super::error::RoleError;
 use super::identity::Identity;
 use super::memory_limit;
 use super::notify::{Meter, write_drops, write_list};
 use super::reload::ReloadRequests;
-use super::role::{Role, RoleError, participant_options};
+use super::role::{Role, participant_options};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{InputTopic, Route, Settings};

@@ -19,8 +19,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tracing::{debug, warn};
 
+use super::super::error::RoleError;
 use super::super::parameter_store::ParameterStore;
-use super::super::role::RoleError;
 use super::super::scheduling;
 use crate::clock;
 use crate::config::{SetParameters, Settings};

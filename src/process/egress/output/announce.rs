@@ -2,7 +2,7 @@
 
 use tracing::{error, info};
 
-use super::super::super::role::RoleError;
+use super::super::super::error::RoleError;
 use super::super::former_readers::FormerReaders;
 use super::super::offer::Offer;
 use super::super::overrun::Overrun;
