@@ -1,7 +1,9 @@
 use std::{
+  cell::RefCell,
   collections::{BTreeSet, HashMap},
   io,
   net::{IpAddr, Ipv4Addr, SocketAddr},
+  time::{Duration, Instant},
 };
 
 use log::error;
@@ -129,10 +131,36 @@ fn enumerate_interfaces() -> io::Result<Vec<IfAddr>> {
 // Per-peer path-MTU resolution
 // ---------------------------------------------------------------------------
 
+/// How long an enumeration is valid. A participant that starts asks four times, and each enumeration reads
+/// some 80 files (1 to 2 ms).
+const ENUMERATION_VALID: Duration = Duration::from_millis(10);
+
 /// Snapshot of the local interface table, used by writers to resolve a per-peer
 /// datagram budget. Built once (and refreshed on interface-set changes) and
 /// shared with each `Writer` via the event loop.
 pub fn local_interface_table() -> Vec<IfAddr> {
+  // Of each thread, as threads may be in different network namespaces.
+  thread_local!(static LAST: RefCell<Option<(Instant, Vec<IfAddr>)>> = const { RefCell::new(None) });
+  LAST.with_borrow_mut(|last| recent(last, Instant::now(), enumerated_table))
+}
+
+/// What `enumerate` has returned, or returns now if that was too long ago.
+fn recent<T: Clone>(
+  last: &mut Option<(Instant, T)>,
+  now: Instant,
+  enumerate: impl FnOnce() -> T,
+) -> T {
+  if let Some((at, table)) = last {
+    if now.saturating_duration_since(*at) < ENUMERATION_VALID {
+      return table.clone();
+    }
+  }
+  let table = enumerate();
+  *last = Some((now, table.clone()));
+  table
+}
+
+fn enumerated_table() -> Vec<IfAddr> {
   match enumerate_interfaces() {
     Ok(ifaces) => ifaces,
     Err(e) => {
@@ -332,11 +360,14 @@ pub(crate) fn build_ifindex_map_inner(ifaces: &[IfAddr]) -> HashMap<u32, Interfa
 
 #[cfg(test)]
 mod tests {
-  use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+  use std::{
+    net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr},
+    time::{Duration, Instant},
+  };
 
   use super::{
     build_ifindex_map_inner, get_local_multicast_ip_addrs_inner, get_local_unicast_locators_inner,
-    listener_locators, multicast_interface_indexes, localhost_spdp_peer_locators, path_mtu_payload_for_peer, with_former, IfAddr, InterfaceSelector, NetworkSelector,
+    listener_locators, multicast_interface_indexes, localhost_spdp_peer_locators, path_mtu_payload_for_peer, recent, with_former, IfAddr, InterfaceSelector, NetworkSelector,
   };
   use crate::{
     network::constant::spdp_well_known_unicast_port,
@@ -380,6 +411,14 @@ mod tests {
       netmask: Some(Ipv4Addr::from(mask)),
       mtu: Some(mtu),
     }
+  }
+
+  #[test]
+  fn an_enumeration_is_valid_for_a_moment() {
+    let mut last = None;
+    let start = Instant::now();
+    let mut at = |ms, now| recent(&mut last, start + Duration::from_millis(ms), || now);
+    assert_eq!([at(0, 1), at(9, 2), at(10, 3), at(19, 4), at(20, 5)], [1, 1, 3, 3, 5]);
   }
 
   #[test]
