@@ -363,6 +363,8 @@ fn readers_that_are_gone_are_not_announced_to_a_new_participant() {
         drop(here.create_reader("rt/gone", TYPE, &qos).unwrap());
     }
     let present = here.create_reader("rt/present", TYPE, &qos).unwrap();
+    // The thread of discovery removes them, perhaps only after the newcomer is there.
+    std::thread::sleep(Duration::from_millis(300));
     let newcomer = participant("newcomer", 81);
     let give_up = Instant::now() + Duration::from_secs(20);
     let mut announced = Vec::new();
