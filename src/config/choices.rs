@@ -1,6 +1,6 @@
 //! The words that a configuration file may have for a value, and what each means.
 
-use super::settings::{DropPolicy, SchedulingPolicy, TrustMode, Verbosity};
+use super::settings::{DropPolicy, SchedulingPolicy, Standby, TrustMode, Verbosity};
 use crate::model::{Durability, Reliability, SubscriberState};
 
 type Words<T> = &'static [(&'static str, T)];
@@ -43,6 +43,10 @@ impl Choice for DropPolicy {
 
 impl Choice for SchedulingPolicy {
     const WORDS: Words<Self> = &[("other", Self::Other), ("fifo", Self::Fifo), ("rr", Self::RoundRobin)];
+}
+
+impl Choice for Standby {
+    const WORDS: Words<Self> = &[("none", Self::None), ("warm", Self::Warm)];
 }
 
 impl Choice for TrustMode {

@@ -6,6 +6,7 @@ use super::qos::{PartialQos, Profiles};
 use super::rates::{self, RoutingPolicy};
 use super::settings::{
     DEFAULT_WINDOW_SAMPLES, DdsNetwork, Forwarding, Lane, NetworkSelector, Scheduling, SchedulingPolicy,
+    Standby,
 };
 use crate::model::{LaneName, TrafficClass};
 
@@ -118,11 +119,22 @@ impl LaneReader<'_> {
             by_reference_min_bytes: field.get("by_reference_min_bytes").count_or_default(),
             window_samples: field.get("window_samples").count().or(window_samples),
             scheduling: scheduling(&field.section("scheduling"), default_scheduling(Some(class))),
+            standby: standby(&field.get("standby"), class),
         };
         let qos =
             if qos.is_map() { PartialQos::read(&qos) } else { self.profiles.named(&qos).unwrap_or_default() };
         LaneDraft { lane, qos }
     }
+}
+
+/// Only critical lanes may have a standby: other lanes keep no identity for it to continue.
+fn standby(field: &Field<'_>, class: TrafficClass) -> Standby {
+    let standby = field.choice_or_default();
+    if standby == Standby::Warm && class == TrafficClass::Noncritical {
+        field.report::<()>("must be none, because only the critical lane and ingress can have a standby");
+        return Standby::None;
+    }
+    standby
 }
 
 /// The DSCP of what must arrive soon (RFC 3246). Wi-Fi sends it before the rest, in the queue for video.

@@ -219,6 +219,7 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     let (routes, patterns, lanes) = routes::read(root, &profiles, &input, drafts, max_sample_bytes);
 
     let processes = root.section("processes");
+    let ingress_standby = processes.section("ingress").get("standby").choice_or_default();
     let process = |name: &str, class| {
         let section = processes.section(name).section("scheduling");
         lanes::scheduling(&section, lanes::default_scheduling(class))
@@ -246,6 +247,7 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
         shared_memory,
         policy_hold_ms: (policy_hold_s * 1_000.0).round() as u64,
         ingress_scheduling: process("ingress", Some(TrafficClass::Critical)),
+        ingress_standby,
         control_scheduling: process("control", None),
         classifier: control::classifier(root),
         probes: control::probes(root, security.max_probe_rate_hz),

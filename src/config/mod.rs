@@ -42,6 +42,6 @@ pub use settings::{
     Classifier, ClassifierThresholds, DdsNetwork, Diagnostics, DropPolicy, Forwarding, InputQos, InputTopic,
     Lane, LaneRates, MetricsListener, NetworkSelector, Output, OutputTopic, Probes, RatePolicy, Route,
     RoutePattern, Safety, SafetyRules, Scheduling, SchedulingPolicy, SecretSource, Security, SetParameters,
-    Settings, SharedMemory, TrustMode, Verbosity,
+    Settings, SharedMemory, Standby, TrustMode, Verbosity,
 };
 pub use shown::Value;

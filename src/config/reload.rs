@@ -71,6 +71,7 @@ impl Settings {
             lanes: self.lanes.iter().map(|lane| reload_lane(lane, &new)).collect(),
             shared_memory: old.shared_memory,
             ingress_scheduling: old.ingress_scheduling,
+            ingress_standby: old.ingress_standby,
             control_scheduling: old.control_scheduling,
             probes: Probes {
                 request_topic: old.probes.request_topic,
@@ -160,8 +161,8 @@ fn compare_settings(d: &mut Differences, old: &Settings, new: &Settings) {
     compare!(d, "", old, new, Settings {
         instance;
         input, node_namespace, node_name, graph_gid_bytes, routes, patterns, lanes, shared_memory,
-        policy_hold_ms, ingress_scheduling, control_scheduling, classifier, probes, safety, security,
-        diagnostics, overrides, subscribers, set_parameters
+        policy_hold_ms, ingress_scheduling, ingress_standby, control_scheduling, classifier, probes, safety,
+        security, diagnostics, overrides, subscribers, set_parameters
     });
     compare_network(d, "ros", &old.input, &new.input);
     d.add("ros.namespace", &old.node_namespace, &new.node_namespace);
@@ -172,6 +173,7 @@ fn compare_settings(d: &mut Differences, old: &Settings, new: &Settings) {
     });
     d.add("policy_hold_s", &seconds(old.policy_hold_ms), &seconds(new.policy_hold_ms));
     compare_scheduling(d, "processes.ingress", &old.ingress_scheduling, &new.ingress_scheduling);
+    d.add("processes.ingress.standby", &old.ingress_standby, &new.ingress_standby);
     compare_scheduling(d, "processes.control", &old.control_scheduling, &new.control_scheduling);
     compare_control(d, old, new);
     compare_entries(d, "overrides", &old.overrides, &new.overrides);
@@ -267,7 +269,7 @@ fn compare_output(
 fn compare_lane(d: &mut Differences, old: &Lane, new: &Lane) {
     let of = &format!("lanes.{}", old.name);
     compare!(d, of, old, new, Lane {
-        dscp, queue_depth, max_borrowed, by_reference_min_bytes, window_samples;
+        dscp, queue_depth, max_borrowed, by_reference_min_bytes, window_samples, standby;
         name, forwarding, network, outputs, scheduling
     });
     // A lane of the same name has the same class.

@@ -41,6 +41,8 @@ pub struct Settings {
     pub policy_hold_ms: u64,
     /// Scheduling of the ingress process.
     pub ingress_scheduling: Scheduling,
+    /// Whether ingress has a standby.
+    pub ingress_standby: Standby,
     /// Scheduling of the control process.
     pub control_scheduling: Scheduling,
     /// The classifier (paper, section III-C).
@@ -317,6 +319,8 @@ pub struct Lane {
     pub window_samples: Option<usize>,
     /// Scheduling of the lane's process.
     pub scheduling: Scheduling,
+    /// Whether the lane's process has a standby; only that of a critical lane may.
+    pub standby: Standby,
 }
 
 impl Lane {
@@ -416,6 +420,16 @@ pub enum SchedulingPolicy {
     Fifo,
     /// `SCHED_RR`.
     RoundRobin,
+}
+
+/// Whether a process has a second one, which takes its role over when it ends.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Standby {
+    /// No: the supervisor starts the next process.
+    #[default]
+    None,
+    /// The second process is started with the first one, and waits.
+    Warm,
 }
 
 /// The settings of the classifier.

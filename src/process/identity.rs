@@ -12,7 +12,9 @@ use tracing::{info, warn};
 use super::error::RoleError;
 use super::kept_sockets;
 use super::role::Role;
+use super::standby::Successor;
 use crate::clock;
+use crate::config::Standby;
 use crate::dds::{DdsError, Kept, Participant, ParticipantIdentity, ParticipantOptions, host_addresses};
 use crate::model::{Guid, MonotonicNs, ProcessHealth, ProcessIdentity};
 use crate::shm::{BoardWriter, Journal, ProcessRole};
@@ -53,6 +55,8 @@ pub(super) struct Identity {
     /// Whether discovery has changed since the journal was written.
     is_outdated: bool,
     journal_at: MonotonicNs,
+    /// `None` if the role has no standby.
+    successor: Option<Successor>,
 }
 
 impl Identity {
@@ -63,6 +67,7 @@ impl Identity {
         process: ProcessRole,
         name: &str,
         options: &ParticipantOptions,
+        standby: Standby,
         open: impl Fn(Kept) -> Result<Participant, DdsError>,
     ) -> Result<(Participant, Self, bool), RoleError> {
         let mut identity = Self {
@@ -74,8 +79,9 @@ impl Identity {
             proven_at: clock::monotonic().plus_ms(PROVEN_AFTER_MS),
             is_outdated: false,
             journal_at: MonotonicNs(0),
+            successor: None,
         };
-        let sockets = kept_sockets::inherited();
+        let sockets = role.sockets();
         let inherited = sockets.len();
         let mut kept = Kept { former: identity.former(role), sockets };
         let mut former = None;
@@ -109,8 +115,15 @@ impl Identity {
             None => open(kept)?,
         };
         role.record_participant(&participant);
-        if let Err(error) = participant.sockets().and_then(|sockets| kept_sockets::store(&sockets)) {
-            warn!(role = name, %error, "the sockets are not kept; after a kill, what arrives meanwhile is lost");
+        let stored =
+            participant.sockets().and_then(|sockets| kept_sockets::store(&sockets).map(|()| sockets));
+        match stored {
+            Ok(sockets) => identity.successor = (standby == Standby::Warm).then(|| role.successor(sockets)),
+            Err(error) => warn!(
+                role = name,
+                %error,
+                "the sockets are not kept; after a kill, what arrives meanwhile is lost"
+            ),
         }
         let unproven = if continued { identity.board.get().unproven } else { 0 };
         identity.record(&participant, unproven);
@@ -175,6 +188,9 @@ impl Identity {
     pub fn housekeeping(&mut self, participant: &Participant, discovery_changed: bool, now: MonotonicNs) {
         let unproven = if now < self.proven_at { self.board.get().unproven } else { 0 };
         self.record(participant, unproven);
+        if let Some(successor) = &mut self.successor {
+            successor.housekeeping();
+        }
         self.is_outdated |= discovery_changed;
         if !self.is_kept || !self.is_outdated || now < self.journal_at {
             return;
@@ -190,6 +206,9 @@ impl Identity {
     pub fn end(&mut self) {
         if self.board.get().is_intact() {
             kept_sockets::forget();
+        }
+        if let Some(successor) = &mut self.successor {
+            successor.end();
         }
         self.is_kept = false;
         self.board.set(ProcessIdentity::default());

@@ -76,6 +76,21 @@ pub(super) fn store(sockets: &[UdpSocket]) -> io::Result<()> {
     if fds.is_empty() { Ok(()) } else { send_to_supervisor(STORE, &fds) }
 }
 
+/// Sends duplicates of the sockets to a standby.
+///
+/// # Errors
+/// The connection has ended, or its queue is full.
+pub(super) fn hand_over(connection: BorrowedFd<'_>, sockets: &[UdpSocket]) -> io::Result<()> {
+    let fds: Vec<RawFd> = sockets.iter().map(AsRawFd::as_raw_fd).collect();
+    send(connection.as_raw_fd(), STORE, &fds)
+}
+
+/// Makes a standby close the sockets that it got from this process.
+pub(super) fn take_back(connection: BorrowedFd<'_>) {
+    // A connection that has ended has no standby.
+    let _ = send(connection.as_raw_fd(), FORGET, &[]);
+}
+
 /// Makes the supervisor close the sockets that it keeps for this process.
 pub(super) fn forget() {
     if let Err(error) = send_to_supervisor(FORGET, &[]) {
@@ -87,13 +102,13 @@ pub(super) fn forget() {
 pub(super) enum Request {
     Store(Vec<UdpSocket>),
     Forget,
-    /// A message that has no meaning here.
+    /// A message that has no meaning here, or the end of a connection.
     Unknown,
 }
 
 /// Receives the next message that has arrived; `None` if there is none. Closes whatever is attached that is
 /// not a socket to store.
-pub(super) fn receive(socket: &UnixDatagram) -> Option<Request> {
+pub(super) fn receive(socket: &impl AsRawFd) -> Option<Request> {
     let mut bytes = [0; 64];
     let mut attached = cmsg_space!([RawFd; MAX_ATTACHED]);
     let mut parts = [IoSliceMut::new(&mut bytes)];

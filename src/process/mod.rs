@@ -19,12 +19,14 @@ mod memory;
 mod memory_limit;
 mod notify;
 mod parameter_store;
+mod place;
 pub mod probes;
 mod reload;
 mod responder;
 mod role;
 mod scheduling;
 mod socket_store;
+mod standby;
 mod stop;
 mod supervisor;
 #[cfg(test)]

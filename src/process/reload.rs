@@ -130,6 +130,63 @@ impl Terminal {
     }
 }
 
+/// The reload thread of a process that has no role yet. It has the scheduling with which the process was
+/// started, and handles no request until the process has its role.
+pub(super) struct WaitingReloads {
+    pub in_force: Configuration,
+    share: Option<InForceShare>,
+    parameters: Option<ParameterStore>,
+    outcomes: Receiver<Outcome>,
+    begin: SyncSender<(Reloader, PathBuf)>,
+}
+
+impl WaitingReloads {
+    /// Starts the thread, with the scheduling of the calling one.
+    pub fn start(requests: ReloadRequests, settings: &Settings) -> io::Result<Self> {
+        let (in_force, share) = match requests.in_force {
+            Some(InForce { configuration, share }) => (configuration, Some(share)),
+            None => (settings.clone().into(), None),
+        };
+        let (request, file) = (requests.request, share.as_ref().map(InForceShare::file));
+        let parameters = file.map(|file| ParameterStore::new(Arc::clone(&request.load), file));
+        // Of capacity 0: the thread writes the note only after housekeeping has taken the outcome.
+        let (sender, outcomes) = sync_channel(0);
+        let (begin, begun) = sync_channel::<(Reloader, PathBuf)>(1);
+        let thread = std::thread::Builder::new().name("reload".to_owned());
+        #[allow(clippy::disallowed_methods, reason = "this thread handles no samples")]
+        thread.spawn(move || {
+            // An error is the end of a process that got no role.
+            if let Ok((reloader, note)) = begun.recv() {
+                serve(request, reloader, &sender, &note);
+            }
+        })?;
+        Ok(Self { in_force, share, parameters, outcomes, begin })
+    }
+
+    /// Reads what the other processes have put in force since this one was started.
+    pub fn refresh(&mut self) {
+        let Some(share) = &self.share else { return };
+        let stored = share.file().read().ok().flatten();
+        if let Some(stored) = stored.and_then(|bytes| Configuration::decode(&bytes).ok()) {
+            self.in_force = self.in_force.reloaded(stored).0;
+        }
+    }
+
+    /// Handles requests from now on. Outcomes go to the file `note`.
+    pub fn begin(self, note: PathBuf) -> Reloads {
+        let file = self.share.as_ref().map(InForceShare::file);
+        // The thread waits for this message.
+        let _ = self.begin.send((Reloader { current: self.in_force.clone(), file }, note));
+        Reloads {
+            in_force: self.in_force,
+            refused: 0,
+            outcomes: Some(self.outcomes),
+            parameters: self.parameters,
+            _share: self.share,
+        }
+    }
+}
+
 /// The configuration in force of this process, updated by reloads.
 pub(super) struct Reloads {
     pub in_force: Configuration,
@@ -146,22 +203,6 @@ pub(super) struct Reloads {
 type Outcome = Option<Box<Configuration>>;
 
 impl Reloads {
-    /// Starts the reload thread, with the scheduling of the calling one. Outcomes go to the file `note`.
-    pub fn start(requests: ReloadRequests, settings: &Settings, note: PathBuf) -> io::Result<Self> {
-        let (in_force, share) = match requests.in_force {
-            Some(InForce { configuration, share }) => (configuration, Some(share)),
-            None => (settings.clone().into(), None),
-        };
-        let (request, file) = (requests.request, share.as_ref().map(InForceShare::file));
-        let parameters = file.clone().map(|file| ParameterStore::new(Arc::clone(&request.load), file));
-        // Of capacity 0: the thread writes the note only after housekeeping has taken the outcome.
-        let (sender, outcomes) = sync_channel(0);
-        let reloader = Reloader { current: in_force.clone(), file };
-        let thread = std::thread::Builder::new().name("reload".to_owned());
-        thread.spawn(move || serve(request, reloader, &sender, &note))?;
-        Ok(Self { in_force, refused: 0, outcomes: Some(outcomes), parameters, _share: share })
-    }
-
     /// Takes the outcome of a request, puts its configuration in force, and returns whether the file was
     /// valid; `None` if no reload has completed since the last call. Even if a valid file has not changed,
     /// the files that it refers to, such as that of a secret, are to be read again. Never waits, and

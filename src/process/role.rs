@@ -1,18 +1,20 @@
 //! Start-up and shutdown that ingress, egress and control share: lock, reloads, scheduling, shared memory,
 //! health, DDS participant.
 
-use tracing::info;
+use std::net::UdpSocket;
 
 use super::error::RoleError;
+use super::kept_sockets;
 use super::notify::Notifier;
 use super::parameter_store::ParameterStore;
-use super::reload::{ReloadRequests, Reloads};
-use super::scheduling;
+use super::place::Place;
+use super::reload::Reloads;
+use super::standby::{Successor, TakeOver};
 use crate::clock;
-use crate::config::{Configuration, DdsNetwork, Scheduling, Settings};
+use crate::config::{Configuration, DdsNetwork, Settings};
 use crate::dds::{Participant, ParticipantOptions};
 use crate::model::{MonotonicNs, NetworkRefusals, ProcessHealth};
-use crate::shm::{BoardWriter, Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, root_of};
+use crate::shm::{BoardWriter, Boards, ProcessRole, RoleLock, ShmNode};
 use crate::telemetry;
 
 pub(super) fn lane_index(settings: &Settings, name: &str) -> Result<usize, RoleError> {
@@ -31,34 +33,17 @@ pub(super) struct Role {
     pub notifier: Notifier,
     /// What the former process wrote last; its participant is all zero once it is disposed of.
     pub former: ProcessHealth,
+    /// Until the first turn of a process that was a standby.
+    take_over: Option<TakeOver>,
     /// The last field, so that the lock is released only after everything else is dropped.
-    _lock: RoleLock,
+    lock: RoleLock,
 }
 
 impl Role {
-    /// Locks the role `name`, applies its scheduling and attaches to shared memory.
-    pub fn open(
-        settings: &Settings,
-        requests: ReloadRequests,
-        role: ProcessRole,
-        name: &str,
-        scheduling: &Scheduling,
-    ) -> Result<Self, RoleError> {
-        let root = root_of(settings);
-        let lock = RoleLock::acquire(&root, &settings.instance, name)?;
-        // Before the scheduling, which is for the data path: the reload thread runs without it.
-        let reloads = Reloads::start(requests, settings, lock.note_path())?;
-        scheduling::apply(scheduling);
-        let node = ShmNode::open(&root, &settings.instance, name)?;
-        let cleaned = node.cleaned_up();
-        if cleaned.dead_processes > 0 {
-            info!(
-                dead_processes = cleaned.dead_processes,
-                not_yet = cleaned.failed,
-                "cleaned up in shared memory after processes that died"
-            );
-        }
-        let boards = node.boards(&BridgeShape::of(settings))?;
+    /// Begins to serve the role of `place`.
+    pub fn open(place: Place, role: ProcessRole) -> Self {
+        let Place { lock, node, boards, reloads, take_over } = place;
+        let reloads = reloads.begin(lock.note_path());
         let mut health = boards.health_writer(role);
         let now = clock::monotonic();
         let former = *health.get();
@@ -73,7 +58,21 @@ impl Role {
                 ..ProcessHealth::default()
             };
         });
-        Ok(Self { node, boards, reloads, health, notifier: Notifier::new(), former, _lock: lock })
+        Self { node, boards, reloads, health, notifier: Notifier::new(), former, take_over, lock }
+    }
+
+    /// The sockets that this process goes on with, from the process that it has taken the role over from, or
+    /// else from its supervisor. Once.
+    pub fn sockets(&mut self) -> Vec<UdpSocket> {
+        match &mut self.take_over {
+            Some(take_over) => std::mem::take(&mut take_over.sockets),
+            None => kept_sockets::inherited(),
+        }
+    }
+
+    /// Sends `sockets` to the standby of this role.
+    pub fn successor(&self, sockets: Vec<UdpSocket>) -> Successor {
+        Successor::new(self.lock.standby_socket(), sockets)
     }
 
     /// Opens the DDS participant. If the former process was killed, the participant disposes of
@@ -140,6 +139,9 @@ impl Role {
             health.policy_epoch = policy_epoch;
             health.network_refusals = network_refusals;
         });
+        if let Some(take_over) = self.take_over.take() {
+            take_over.complete();
+        }
         self.notifier.feed_watchdog(now);
     }
 }

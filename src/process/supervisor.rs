@@ -22,9 +22,10 @@ use super::in_force::{FOLDER_VARIABLE, InForce};
 use super::notify::{Notifier, write_list};
 use super::reload::{HangUp, HangUpMeaning, with_hang_up_blocked};
 use super::socket_store::{self, SocketStore};
+use super::standby::NO_WATCHDOG_VARIABLE;
 use super::stop::Stop;
 use crate::clock;
-use crate::config::{Configuration, Settings};
+use crate::config::{Configuration, Settings, Standby};
 use crate::model::{MonotonicNs, TrafficClass};
 use crate::policy::{ChildExit, GiveUpReason, HangWatch, RestartBackoff, RestartDecision};
 use crate::shm::{RoleLock, ShmError, root_of};
@@ -40,6 +41,10 @@ const READ_BOARDS_MS: u64 = 250;
 /// and restarted. The service units have the same as `WatchdogSec`.
 const HANG_CRITICAL_MS: u64 = 2_000;
 const HANG_MS: u64 = 5_000;
+
+/// How long a child that has a standby is not restarted: its start would take CPU time from the take-over,
+/// which takes some 10 ms.
+const TAKE_OVER_MS: u64 = 200;
 
 /// How long a child may take to complete its first turn before it is killed and restarted. The service units
 /// have the same as `TimeoutStartSec`.
@@ -115,18 +120,31 @@ pub fn up(
     // The lock file tells another `up` the process id of this one.
     let _lock = RoleLock::acquire(&root, &settings.instance, "up")?;
     let folder = root.join(settings.instance.as_str());
-    let ingress = Supervised::new("ingress", &["ingress"], arguments, &folder, HANG_CRITICAL_MS);
-    let mut children = vec![ingress.keep_sockets()];
-    for lane in settings.lanes.iter().filter(|lane| lane.is_used()) {
-        let name = format!("egress-{}", lane.name);
+    let mut children = Vec::new();
+    let mut add_kept = |role: &str, own: &[&str], standby| {
+        let second = (standby == Standby::Warm).then(|| format!("{role}-2"));
+        for name in [Some(role.to_owned()), second].into_iter().flatten() {
+            let child = Supervised::new(&name, own, arguments, &folder, HANG_CRITICAL_MS);
+            children.push(Supervised { role: role.to_owned(), ..child.keep_sockets() });
+        }
+    };
+    add_kept("ingress", &["ingress"], settings.ingress_standby);
+    let (critical, others): (Vec<_>, Vec<_>) = settings
+        .lanes
+        .iter()
+        .filter(|lane| lane.is_used())
+        .partition(|lane| lane.class() == TrafficClass::Critical);
+    for lane in critical {
         let own = ["egress", "--lane", lane.name.as_str()];
-        children.push(if lane.class() == TrafficClass::Critical {
-            Supervised::new(&name, &own, arguments, &folder, HANG_CRITICAL_MS).keep_sockets()
-        } else {
-            Supervised::new(&name, &own, arguments, &folder, HANG_MS)
-        });
+        add_kept(&format!("egress-{}", lane.name), &own, lane.standby);
+    }
+    for lane in others {
+        let own = ["egress", "--lane", lane.name.as_str()];
+        let name = format!("egress-{}", lane.name);
+        children.push(Supervised::new(&name, &own, arguments, &folder, HANG_MS));
     }
     children.push(Supervised::new("control", &["control"], arguments, &folder, HANG_MS));
+    children.iter_mut().for_each(|child| child.watchdog = watchdog);
     let mut child_ends = ChildEnds::watch();
     let mut outcome = Ok(());
     for child in &mut children {
@@ -150,8 +168,11 @@ pub fn up(
             None => {}
         }
         let now = clock::monotonic();
-        for child in &mut children {
-            child.poll(now);
+        for index in 0..children.len() {
+            let role = &children[index].role;
+            let of_role = children.iter().filter(|child| child.role == *role && child.process.is_some());
+            let has_standby = of_role.count() > 1;
+            children[index].poll(has_standby, now);
         }
         report.send(&mut children, now);
         if children.iter().all(|child| child.state == State::GaveUp) {
@@ -234,14 +255,16 @@ impl<'a> ManagerReport<'a> {
         };
         let mut turned = 0;
         for child in &mut *children {
-            let reading = next.processes.iter().find(|reading| reading.name == child.name);
-            let health = reading.map(|reading| &reading.health);
+            let reading = next.processes.iter().find(|reading| reading.name == child.role);
             // A child that has not completed its first turn is still starting.
-            let health = health.filter(|one| one.turns > 0 && Some(one.pid) == child.pid());
-            turned += usize::from(health.is_some());
-            match health {
+            let health = reading.map(|reading| (reading.health.pid, reading.health.alive_at));
+            let health = health.filter(|_| reading.is_some_and(|reading| reading.health.turns > 0));
+            let standby = reading.map(|reading| (reading.standby.pid, reading.standby.alive_at));
+            let own = [health, standby].into_iter().flatten().find(|(pid, _)| Some(*pid) == child.pid());
+            turned += usize::from(own.is_some());
+            match own {
                 _ if !self.watchdog => {}
-                Some(health) => child.check_progress(health.alive_at, now),
+                Some((_, alive_at)) => child.check_progress(alive_at, now),
                 None => child.check_start(now),
             }
         }
@@ -306,12 +329,16 @@ enum State {
 
 /// A child process, with its command line and its restarts.
 struct Supervised {
+    /// The name of its role, and a number if it is the second process of the role.
     name: String,
+    role: String,
     arguments: Vec<OsString>,
     folder: PathBuf,
     process: Option<Child>,
     backoff: RestartBackoff,
     state: State,
+    /// Whether it is killed when it makes no progress.
+    watchdog: bool,
     /// How long it may make no progress.
     hang_ms: u64,
     hang_watch: HangWatch,
@@ -329,11 +356,13 @@ impl Supervised {
         arguments.extend_from_slice(common);
         Self {
             name: name.to_owned(),
+            role: name.to_owned(),
             arguments,
             folder: folder.to_owned(),
             process: None,
             backoff: RestartBackoff::new(now),
             state: State::Running,
+            watchdog: true,
             hang_ms,
             hang_watch: HangWatch::new(hang_ms, now),
             start_watch: HangWatch::new(START_MS, now),
@@ -355,6 +384,9 @@ impl Supervised {
         let mut command = Command::new(&program);
         // A copy of the program may have the name of an executable of the original package.
         command.arg0(program.with_file_name("adaptive-bridge"));
+        if !self.watchdog {
+            command.env(NO_WATCHDOG_VARIABLE, "1");
+        }
         command.args(&self.arguments).env(SUPERVISOR_VARIABLE, std::process::id().to_string());
         command.env(FOLDER_VARIABLE, &self.folder);
         // The service manager supervises this process only.
@@ -381,8 +413,9 @@ impl Supervised {
         self.process.as_ref().map(|process| u64::from(process.id()))
     }
 
-    /// Notices the end of the child, and restarts it when its backoff is over.
-    fn poll(&mut self, now: MonotonicNs) {
+    /// Notices the end of the child, and restarts it when its backoff is over; with a standby, not before
+    /// that has taken the role over.
+    fn poll(&mut self, has_standby: bool, now: MonotonicNs) {
         if self.state == State::Running {
             let ended = self.process.as_mut().map(Child::try_wait);
             // After the line above, so that a socket that the child stored just before its end is kept.
@@ -395,6 +428,9 @@ impl Supervised {
                     let exit = exit_of(status);
                     warn!(child = self.name, ?exit, "ended unexpectedly");
                     self.ended(exit, now);
+                    if has_standby && let State::RestartAt(at) = &mut self.state {
+                        *at = MonotonicNs(at.0.max(now.plus_ms(TAKE_OVER_MS).0));
+                    }
                 }
                 Some(Err(error)) => {
                     error!(child = self.name, %error, "cannot read the state of the child process");

@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use super::place::Place;
 use super::reload::ReloadRequests;
 use super::role::Role;
 use crate::config::{self, Scheduling, Settings};
@@ -29,7 +30,8 @@ pub fn open(
         config::parse(&text, "f.yaml", &|_| None).unwrap_or_else(|error| panic!("{text}\n{error}"));
     let read = settings.clone();
     let reloads = ReloadRequests::on_signal(move |_| Ok(read.clone().into())).unwrap();
-    let role = Role::open(&settings, reloads, process, name, &Scheduling::default()).unwrap();
+    let place = Place::take(&settings, reloads, name, &Scheduling::default()).unwrap();
+    let role = Role::open(place, process);
     (role, settings, folder)
 }
 

@@ -24,8 +24,8 @@ use crate::model::{
     AbsenceRecord, Backlog, ControlRecord, EndpointIdentity, IngressCounters, InstanceName, IntruderRecord,
     LaneCounters, LaneName, LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS,
     MAX_PUBLISHERS, MAX_SUBSCRIBERS, MonotonicNs, NamedEndpoint, OutputReaders, PartialSample, PatternRecord,
-    ProcessHealth, ProcessIdentity, PublisherAccount, Reliability, RouteId, RouteInfo, SubscriberRecord,
-    fnv1a,
+    ProcessHealth, ProcessIdentity, PublisherAccount, Reliability, RouteId, RouteInfo, StandbyRecord,
+    SubscriberRecord, fnv1a,
 };
 
 /// The lanes and routes for which the boards have room. It must be the same in all processes of an instance.
@@ -79,7 +79,7 @@ pub enum Stage {
 }
 
 /// Incremented whenever the meaning of a word in the segment changes.
-const LAYOUT_VERSION: u32 = 14;
+const LAYOUT_VERSION: u32 = 15;
 /// The readers of a route: one for the publishers of each reliability.
 const READERS: usize = 2;
 /// "ABboards": the first word, by which a file of another program is rejected.
@@ -93,6 +93,7 @@ struct Layout {
     routes: usize,
     wake: usize,
     health: usize,
+    standby: usize,
     policy: usize,
     control: usize,
     subscriber: usize,
@@ -129,6 +130,7 @@ impl Layout {
             routes,
             wake: next(lanes * LINE),
             health: next((2 + lanes) * Cell::<ProcessHealth>::WORDS),
+            standby: next((2 + lanes) * Cell::<StandbyRecord>::WORDS),
             policy: next(lanes * Cell::<LanePolicy>::WORDS),
             control: next(Cell::<ControlRecord>::WORDS),
             subscriber: next(MAX_SUBSCRIBERS * Cell::<SubscriberRecord>::WORDS),
@@ -236,6 +238,8 @@ macro_rules! boards {
 boards! {
     /// The health of a process.
     health, health_writer(role: ProcessRole): ProcessHealth = |layout| layout.process(role);
+    /// The standby of a process. Its writer is the holder of the standby's lock.
+    standby, standby_writer(role: ProcessRole): StandbyRecord = |layout| layout.process(role);
     /// The state and decisions of control that concern the whole bridge.
     control, control_writer(): ControlRecord = |layout| 0;
     /// The record of the subscriber at an index below [`MAX_SUBSCRIBERS`].
@@ -479,6 +483,8 @@ mod tests {
         let mut found = vec![
             place(layout.health(ProcessRole::Ingress)),
             place(layout.health(ProcessRole::Control)),
+            place(layout.standby(ProcessRole::Ingress)),
+            place(layout.standby(ProcessRole::Control)),
             place(layout.identity(ProcessRole::Ingress)),
             place(layout.identity(ProcessRole::Control)),
             place(layout.control()),
@@ -486,6 +492,7 @@ mod tests {
         for lane in 0..lanes {
             found.push((layout.wake(lane), LINE));
             found.push(place(layout.health(ProcessRole::Egress(lane))));
+            found.push(place(layout.standby(ProcessRole::Egress(lane))));
             found.push(place(layout.policy(lane)));
             found.push(place(layout.identity(ProcessRole::Egress(lane))));
         }

@@ -14,7 +14,7 @@ use crate::model::{
     AbsenceRecord, Backlog, ControlRecord, DropReason, EndpointIdentity, IngressCounters, IntruderRecord,
     LaneCounters, LanePolicy, LatencyHistogram, MAX_OUTPUT_READERS, MAX_UNMATCHED_READERS, NamedEndpoint,
     NetworkRefusal, OutputReaders, PartialSample, PatternRecord, ProbeRefusal, ProcessHealth,
-    ProcessIdentity, PublisherAccount, RouteInfo, SubscriberRecord,
+    ProcessIdentity, PublisherAccount, RouteInfo, StandbyRecord, SubscriberRecord,
 };
 
 /// Words of a cache line. Every value begins on a new line, so that two writers never share a line.
@@ -52,6 +52,7 @@ macro_rules! plain {
 }
 
 plain! {
+    StandbyRecord: 5,
     ProcessHealth: 12 + NetworkRefusal::COUNT,
     ControlRecord: 7 + ProbeRefusal::COUNT + 5 + 1 + 16,
     SubscriberRecord: 16 + 9 + 1 + 16,

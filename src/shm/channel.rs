@@ -18,7 +18,7 @@ use super::error::ShmError;
 use super::header::WireHeader;
 use super::node::{NodeShared, StartLock};
 use super::service::Service;
-use crate::config::{Lane, Settings};
+use crate::config::{Lane, Settings, Standby};
 use crate::model::{RouteId, fnv1a};
 
 /// The most samples that the DDS library assembles in the pool at the same time; others are copied into it
@@ -65,7 +65,8 @@ pub struct RouteChannel {
     pub route: RouteId,
     /// The largest payload that the route allows.
     pub max_sample_bytes: usize,
-    /// The queues of the lanes that serve the route.
+    /// The queues of the lanes that serve the route. A lane with a standby has two: after a take-over that of
+    /// the dead process remains until the next process starts and cleans up.
     pub lanes: Vec<QueueLimits>,
     /// The most taps of the route at the same time.
     pub max_taps: usize,
@@ -126,10 +127,14 @@ impl RouteChannel {
     pub fn of(settings: &Settings, route: usize) -> Self {
         let serves = |lane: &&Lane| lane.outputs.iter().any(|output| output.route == route);
         let configured = &settings.routes[route];
+        let queues = |lane: &Lane| {
+            let processes = if lane.standby == Standby::Warm { 2 } else { 1 };
+            std::iter::repeat_n(QueueLimits::of(lane), processes)
+        };
         Self {
             route: configured.id.clone(),
             max_sample_bytes: configured.max_sample_bytes,
-            lanes: settings.lanes.iter().filter(serves).map(QueueLimits::of).collect(),
+            lanes: settings.lanes.iter().filter(serves).flat_map(queues).collect(),
             max_taps: settings.shared_memory.max_taps,
             retained_samples: configured.retained_samples,
             backlog_samples: if settings.is_critical(route) { configured.backlog_samples } else { 0 },

@@ -17,6 +17,9 @@ const LOCKS: &str = "/proc/locks";
 
 const ROLE_PREFIX: &str = "role-";
 
+/// What the name of the lock of a standby begins with, before the role that it waits for.
+const STANDBY_PREFIX: &str = "standby-";
+
 /// The right to serve a role of an instance, such as `ingress` or `egress-critical`. Held until it is
 /// dropped; the kernel releases it when the process ends, in any way.
 #[derive(Debug)]
@@ -37,6 +40,22 @@ impl RoleLock {
                 Err(error) => Err(ShmError::os("to lock", &path, &error)),
             }
         })
+    }
+
+    /// Takes the right to wait for a role: a role has one standby.
+    ///
+    /// # Errors
+    /// As for [`acquire`](Self::acquire): another process waits for the role already.
+    pub fn acquire_standby(root: &Path, instance: &InstanceName, role: &str) -> Result<Self, ShmError> {
+        Self::acquire(root, instance, &format!("{STANDBY_PREFIX}{role}"))
+    }
+
+    /// The path of the socket of the role's standby, for the lock of the role and for that of the standby.
+    pub fn standby_socket(&self) -> PathBuf {
+        let name = self.lock.path.file_stem().unwrap_or_default().to_string_lossy();
+        let role = name.strip_prefix(ROLE_PREFIX).unwrap_or(&name);
+        let role = role.strip_prefix(STANDBY_PREFIX).unwrap_or(role);
+        self.lock.path.with_file_name(format!("{STANDBY_PREFIX}{role}.socket"))
     }
 
     /// The path of a file beside the lock, in which the holder reports the result of its last reload

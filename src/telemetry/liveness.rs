@@ -1,6 +1,8 @@
 //! Determines the state of a bridge process from its health board and from the kernel.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io;
+use std::os::unix::fs::FileExt;
 
 use serde::Serialize;
 
@@ -71,10 +73,35 @@ impl ProcessState {
 
 /// The state letter of a process (proc_pid_stat(5)); `None` when no process has that id.
 fn kernel_state(pid: u64) -> Option<char> {
-    let stat = fs::read(format!("/proc/{pid}/stat")).ok()?;
+    state_letter(&fs::read(format!("/proc/{pid}/stat")).ok()?)
+}
+
+fn state_letter(stat: &[u8]) -> Option<char> {
     // The command name before it is in parentheses and may contain any character.
     let end_of_name = stat.iter().rposition(|&byte| byte == b')')?;
     stat.get(end_of_name + 2).copied().map(char::from)
+}
+
+/// The open file with the state of a process, for checks many times a second.
+#[derive(Debug)]
+pub struct StatFile(File);
+
+impl StatFile {
+    /// Opens the file of a process.
+    ///
+    /// # Errors
+    /// No process has that id.
+    pub fn open(pid: i32) -> io::Result<Self> {
+        File::open(format!("/proc/{pid}/stat")).map(Self)
+    }
+
+    /// Whether SIGSTOP has stopped the process. A debugger stops it in another way.
+    pub fn is_stopped(&self) -> bool {
+        // The name has 64 bytes at most.
+        let mut bytes = [0; 128];
+        let length = self.0.read_at(&mut bytes, 0).unwrap_or(0);
+        state_letter(&bytes[..length]) == Some('T')
+    }
 }
 
 #[cfg(test)]

@@ -21,7 +21,7 @@ mod threads;
 pub use diagnostics::{DIAGNOSTIC_ARRAY_TYPE, DIAGNOSTICS_TOPIC, MAX_ARRAY_BYTES, diagnostic_arrays};
 pub use intervals::{IntervalStatistics, Intervals};
 pub use json::{DECISION_TOPIC, Decision, STRING_TYPE, cdr, diagnostics_json, string_message};
-pub use liveness::ProcessState;
+pub use liveness::{ProcessState, StatFile};
 pub use log_limit::log_left_out;
 pub use logs::{set_verbosity, start_logs};
 pub use metrics::{CONTENT_TYPE, MetricsError, MetricsServer, metrics_page};

@@ -12,8 +12,8 @@ use crate::model::{
     AbsenceRecord, ControlRecord, Guid, IngressCounters, InstanceName, IntruderRecord, LaneCounters,
     LaneMode, LaneName, LanePolicy, LatencyHistogram, MAX_ABSENCES, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS,
     MAX_PUBLISHERS, MAX_SUBSCRIBERS, ModeReason, MonotonicNs, NamedEndpoint, OutputReaders, PatternRecord,
-    ProcessHealth, PublisherAccount, RouteId, RouteInfo, SubscriberRecord, TopicName, TrafficClass, TypeName,
-    WallNs,
+    ProcessHealth, PublisherAccount, RouteId, RouteInfo, StandbyRecord, SubscriberRecord, TopicName,
+    TrafficClass, TypeName, WallNs,
 };
 use crate::policy::mode_and_source;
 use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
@@ -23,6 +23,9 @@ use crate::shm::{Boards, BridgeShape, ProcessRole, ShmError, Stage};
 const WHOLE_ATTEMPTS: usize = 100;
 /// See [`WHOLE_ATTEMPTS`].
 const WHOLE_PAUSE: Duration = Duration::from_micros(200);
+
+/// A standby that has not checked its role for this long is gone; it does so each 50 ms.
+const STANDBY_SILENT_MS: u64 = 2_000;
 
 /// The state of a bridge at one time, read from its boards. Reading blocks no process, so the boards are read
 /// one after the other and may differ by the time that this takes.
@@ -78,6 +81,8 @@ pub struct ProcessReading {
     /// Its health record.
     #[serde(flatten)]
     pub health: ProcessHealth,
+    /// Its standby.
+    pub standby: StandbyRecord,
     /// Its state.
     pub state: ProcessState,
 }
@@ -283,7 +288,11 @@ fn process(
     now: MonotonicNs,
 ) -> Result<ProcessReading, ShmError> {
     let health = consistent(boards.health(role))?;
-    Ok(ProcessReading { name, role, health, state: ProcessState::read(&health, now) })
+    let mut standby = consistent(boards.standby(role))?;
+    if now.since(standby.alive_at) > STANDBY_SILENT_MS * 1_000_000 {
+        standby.pid = 0;
+    }
+    Ok(ProcessReading { name, role, health, standby, state: ProcessState::read(&health, now) })
 }
 
 /// The mode of a lane, its reason, and the time at which the policy ends.

@@ -296,8 +296,17 @@ fn process_text(process: &ProcessReport) -> String {
     for (reason, count) in health.network_refusals.iter() {
         let _ = write!(failures, ", {count} {reason}");
     }
+    let mut standby = String::new();
+    if process.reading.standby.pid > 0 {
+        let _ = write!(standby, ", standby {}", process.reading.standby.pid);
+    }
+    if process.reading.standby.take_overs > 0 {
+        let took_ms = process.reading.standby.took_ns as f64 / 1e6;
+        let take_overs = counted(process.reading.standby.take_overs, "take-over");
+        let _ = write!(standby, ", {take_overs} (the last in {took_ms:.0} ms)");
+    }
     let up = process.uptime_s.map_or(String::new(), |uptime_s| format!(", up {}", duration_text(uptime_s)));
-    format!("process {} {}{up}, {restarts}{failures}", health.pid, state.label())
+    format!("process {} {}{up}, {restarts}{standby}{failures}", health.pid, state.label())
 }
 
 fn topic_text(topic: &str) -> String {

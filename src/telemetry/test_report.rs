@@ -10,6 +10,7 @@ use super::report::{
 use super::snapshot::ProcessReading;
 use crate::model::{
     Counts, Guid, IngressCounters, LaneCounters, ProcessHealth, PublisherAccount, ReaderRecord, Reason,
+    StandbyRecord,
 };
 use crate::shm::ProcessRole;
 
@@ -203,6 +204,12 @@ fn process(name: &str) -> ProcessReport {
                 refused_reloads: 99_999,
                 network_refusals: counts(99_999),
                 ..ProcessHealth::default()
+            },
+            standby: StandbyRecord {
+                pid: 4_194_304,
+                take_overs: 99_999,
+                took_ns: 99_999_000,
+                ..Default::default()
             },
             state: ProcessState::Running,
         },

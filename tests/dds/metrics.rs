@@ -9,7 +9,8 @@ use adaptive_bridge::config::{MetricsListener, RoutePattern, SetParameters};
 use adaptive_bridge::model::{
     ControlRecord, DropReason, FixedText, IngressCounters, InstanceName, LaneCounters, LaneMode, LaneName,
     LanePolicy, LatencyHistogram, ModeReason, MonotonicNs, PatternRecord, ProbeRefusal, ProcessHealth,
-    RouteId, RouteInfo, SubscriberRecord, SubscriberState, TopicName, TopicPattern, TrafficClass, WallNs,
+    RouteId, RouteInfo, StandbyRecord, SubscriberRecord, SubscriberState, TopicName, TopicPattern,
+    TrafficClass, WallNs,
 };
 use adaptive_bridge::shm::ProcessRole;
 use adaptive_bridge::telemetry::{
@@ -95,6 +96,7 @@ fn report() -> Report {
             name: "ingress".into(),
             role: ProcessRole::Ingress,
             health,
+            standby: StandbyRecord { pid: 9, take_overs: 2, ..StandbyRecord::default() },
             state: ProcessState::Running,
         }],
         lanes: vec![LaneReading {

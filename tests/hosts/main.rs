@@ -31,4 +31,5 @@ mod readers;
 mod responder;
 mod restarts;
 mod ros2;
+mod standby;
 mod visits;

@@ -494,6 +494,8 @@ const CHOICES: &[(&str, &str, &str)] = &[
     ("shared_memory.root_path", "null", r#""/run/elsewhere""#),
     ("shared_memory.budget_bytes", "268435456", "536870912"),
     ("shared_memory.max_taps", "2", "3"),
+    ("lanes.critical.standby", r#""none""#, r#""warm""#),
+    ("processes.ingress.standby", r#""none""#, r#""warm""#),
     ("processes.ingress.scheduling.nice", "0", "1"),
     ("processes.ingress.scheduling.cpus", "[]", "[1]"),
     ("processes.control.scheduling.lock_memory", "false", "true"),

@@ -3,7 +3,7 @@
 use super::row::Kind::{Choice, Decimal, Flag, Other, Whole};
 use super::row::{AGE, Kind, Row, TOPIC, reloads, restarts};
 use crate::config::choices::{HistoryKind, words};
-use crate::config::settings::{DropPolicy, SchedulingPolicy};
+use crate::config::settings::{DropPolicy, SchedulingPolicy, Standby};
 use crate::model::{Durability, Reliability};
 
 const SAMPLE: Kind = Whole(1, 67_108_864, " bytes");
@@ -242,6 +242,10 @@ pub(super) const ROWS: &[Row] = &[
         .doc("CPUs that the process may run on."),
     restarts(scheduling!("lock_memory"), Flag, "`false`")
         .doc("Lock the memory of the process (`mlockall`), so that it has no page faults."),
+    restarts(&["lanes.<lane>.standby", "processes.ingress.standby"], Choice(words::<Standby>), "`none`").doc(
+        "`warm`: a second process of the critical lane, or of ingress, waits and takes over when the first one \
+         ends, without the time that a start takes. Started by `up` only.",
+    ),
     restarts(&["shared_memory.root_path"], Other("absolute path"), "chosen by the program")
         .doc("Folder of the bridge's own files."),
     restarts(&["shared_memory.max_sample_bytes"], SAMPLE, "16777216")

@@ -22,6 +22,7 @@ use super::count_log::RefusalLog;
 use super::error::RoleError;
 use super::memory_limit;
 use super::notify::write_list;
+use super::place::Place;
 use super::probes::Trust;
 use super::reload::ReloadRequests;
 use super::role::{Role, participant_options};
@@ -109,7 +110,8 @@ impl Control {
         reloads: ReloadRequests,
     ) -> Result<Self, RoleError> {
         let scheduling = &settings.control_scheduling;
-        let mut role = Role::open(settings, reloads, ProcessRole::Control, "control", scheduling)?;
+        let place = Place::take(settings, reloads, "control", scheduling)?;
+        let mut role = Role::open(place, ProcessRole::Control);
         memory_limit::check(settings, ProcessRole::Control);
         let (networks, link_of_lane) = networks(settings);
         let mut participants = Vec::with_capacity(networks.len());

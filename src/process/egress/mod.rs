@@ -30,6 +30,7 @@ use super::error::RoleError;
 use super::identity::Identity;
 use super::memory_limit;
 use super::notify::{Meter, Notifier, write_drops, write_list};
+use super::place::Place;
 use super::reload::ReloadRequests;
 use super::role::{Role, lane_index, participant_options};
 use super::stop::Stop;
@@ -60,7 +61,7 @@ const UNSENT_POLL_NS: u64 = 250_000;
 
 /// How often a lane checks whether the readers have matched that its samples wait for after a restart, and
 /// whether ingress has delivered the samples of the former process.
-const HOLD_POLL_MS: u64 = 5;
+const HOLD_POLL_MS: u64 = 1;
 
 /// What the lane does after a turn.
 enum Turn {
@@ -83,7 +84,14 @@ pub fn egress(
     stop: &Stop,
 ) -> Result<(), RoleError> {
     let index = lane_index(settings, name)?;
-    let mut egress = Egress::open(settings, index, reloads)?;
+    let Lane { scheduling, standby, .. } = &settings.lanes[index];
+    let role_name = format!("egress-{name}");
+    let role = (ProcessRole::Egress(index), &*role_name);
+    let Some(place) = Place::wait(settings, reloads, role, scheduling, *standby, stop)? else {
+        return Ok(());
+    };
+    let settings = &place.settings().clone();
+    let mut egress = Egress::open(settings, index, place, &role_name)?;
     let lane = &settings.lanes[index];
     info!(
         lane = name,
@@ -122,7 +130,8 @@ fn join(
         return Ok((role.join(options)?, None));
     }
     let open = |kept| Participant::open_kept(options, kept);
-    let (participant, identity, continued) = Identity::join(role, process, role_name, options, open)?;
+    let (participant, identity, continued) =
+        Identity::join(role, process, role_name, options, lane.standby, open)?;
     if !continued {
         role.dispose_former(&participant);
     }
@@ -154,16 +163,15 @@ struct Egress {
 }
 
 impl Egress {
-    fn open(settings: &Settings, index: usize, reloads: ReloadRequests) -> Result<Self, RoleError> {
+    fn open(settings: &Settings, index: usize, place: Place, role_name: &str) -> Result<Self, RoleError> {
         let lane = &settings.lanes[index];
-        let role_name = format!("egress-{}", lane.name);
         let process = ProcessRole::Egress(index);
-        let mut role = Role::open(settings, reloads, process, &role_name, &lane.scheduling)?;
+        let mut role = Role::open(place, process);
         memory_limit::check(settings, process);
         let node = format!("egress_{}", lane.name);
         let options =
             ParticipantOptions { dscp: lane.dscp, ..participant_options(settings, &lane.network, &node) };
-        let (mut participant, identity) = join(&mut role, lane, process, &role_name, &options)?;
+        let (mut participant, identity) = join(&mut role, lane, process, role_name, &options)?;
         let mut outputs = Vec::with_capacity(lane.outputs.len());
         let mut more_urgent = Vec::with_capacity(lane.outputs.len());
         let priority = |output: &config::Output| settings.routes[output.route].priority;

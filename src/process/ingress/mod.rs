@@ -25,6 +25,7 @@ use super::error::RoleError;
 use super::identity::Identity;
 use super::memory_limit;
 use super::notify::{Meter, write_drops, write_list};
+use super::place::Place;
 use super::reload::ReloadRequests;
 use super::role::{Role, participant_options};
 use super::stop::Stop;
@@ -37,6 +38,9 @@ use early_waker::EarlyWaker;
 use input::Input;
 use patterns::Patterns;
 use receiving::{Receiving, ServedLane};
+
+/// The name of the role, and of the node.
+const NAME: &str = "ingress";
 
 /// At shutdown, how long ingress continues to take samples that DDS has received or still receives.
 const LAST_SAMPLES_MS: u64 = 200;
@@ -67,7 +71,13 @@ const HOLD_POLL_MS: u64 = 2;
 /// # Errors
 /// Another process serves ingress, or shared memory or DDS cannot be opened.
 pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Result<(), RoleError> {
-    let mut ingress = Ingress::open(settings, reloads)?;
+    let role = (ProcessRole::Ingress, NAME);
+    let (scheduling, standby) = (&settings.ingress_scheduling, settings.ingress_standby);
+    let Some(place) = Place::wait(settings, reloads, role, scheduling, standby, stop)? else {
+        return Ok(());
+    };
+    let settings = &place.settings().clone();
+    let mut ingress = Ingress::open(settings, place)?;
     info!(routes = settings.routes.len(), domain_id = settings.input.domain_id, "ingress is up");
     while !stop.is_requested() {
         ingress.sleep();
@@ -113,9 +123,8 @@ impl Drop for Ingress {
 }
 
 impl Ingress {
-    fn open(settings: &Settings, reloads: ReloadRequests) -> Result<Self, RoleError> {
-        let scheduling = &settings.ingress_scheduling;
-        let mut role = Role::open(settings, reloads, ProcessRole::Ingress, "ingress", scheduling)?;
+    fn open(settings: &Settings, place: Place) -> Result<Self, RoleError> {
+        let mut role = Role::open(place, ProcessRole::Ingress);
         memory_limit::check(settings, ProcessRole::Ingress);
         let mut inputs = Vec::with_capacity(settings.routes.len());
         let budget = PoolBudget::of(settings);
@@ -134,7 +143,7 @@ impl Ingress {
         }
         let urgent: Vec<_> = urgent_routes(settings).collect();
         let receiving = Arc::new(Receiving::new(inputs, lanes, !urgent.is_empty()));
-        let options = participant_options(settings, &settings.input, "ingress");
+        let options = participant_options(settings, &settings.input, NAME);
         let urgent_topics = || {
             urgent.iter().filter_map(|route| match &settings.routes[*route].input_topic {
                 InputTopic::Topic(topic) => Some(topic.to_dds()),
@@ -147,7 +156,7 @@ impl Ingress {
             Participant::open_receiving(&options, kept, unfinished, urgent_topics(), on_arriving, on_received)
         };
         let (participant, identity, continued) =
-            Identity::join(&mut role, ProcessRole::Ingress, "ingress", &options, open)?;
+            Identity::join(&mut role, ProcessRole::Ingress, NAME, &options, settings.ingress_standby, open)?;
         let resume_until = clock::monotonic().plus_ms(RESUME_MS);
         let hold_until = continued.then(|| clock::monotonic().plus_ms(HOLD_MS));
         let patterns = Patterns::open(settings, &role.boards);

@@ -57,6 +57,12 @@ fn processes(page: &mut Page, report: &Report) {
     each("process_starts_total", Counter, "Starts of the process.", |process| {
         Some(process.reading.health.starts as f64)
     });
+    each("process_standby", Gauge, "1 while a standby waits for its role.", |process| {
+        Some(f64::from(u8::from(process.reading.standby.pid > 0)))
+    });
+    each("process_take_overs_total", Counter, "How often a standby has taken its role over.", |process| {
+        Some(process.reading.standby.take_overs as f64)
+    });
     each("process_turns_total", Counter, "Turns of its data path.", |process| {
         Some(process.reading.health.turns as f64)
     });

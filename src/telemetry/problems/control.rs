@@ -237,7 +237,8 @@ mod tests {
     use super::super::tests::{healthy, problems_after};
     use super::*;
     use crate::model::{
-        FixedText, IntruderRecord, LaneMode, ProcessHealth, SubscriberRecord, SubscriberWarning,
+        FixedText, IntruderRecord, LaneMode, ProcessHealth, StandbyRecord, SubscriberRecord,
+        SubscriberWarning,
     };
     use crate::telemetry::liveness::ProcessState;
     use crate::telemetry::snapshot::{ProcessReading, SubscriberReading};
@@ -263,6 +264,7 @@ mod tests {
             name: "control".into(),
             role: ProcessRole::Control,
             health,
+            standby: StandbyRecord::default(),
             state: ProcessState::Running,
         }
     }

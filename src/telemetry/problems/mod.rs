@@ -265,7 +265,7 @@ pub(super) mod tests {
     use crate::model::{
         ControlRecord, Guid, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy,
         LatencyHistogram, ModeReason, MonotonicNs, OutputReaders, ProcessHealth, ReaderRecord, RouteId,
-        RouteInfo, TopicName, WallNs,
+        RouteInfo, StandbyRecord, TopicName, WallNs,
     };
 
     /// A bridge without problems: one route and two lanes, each of which has forwarded 100 samples.
@@ -276,6 +276,7 @@ pub(super) mod tests {
             name: name.into(),
             role,
             health,
+            standby: StandbyRecord::default(),
             state: ProcessState::Running,
         };
         let lane = |name, class| LaneReading {

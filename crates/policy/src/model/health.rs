@@ -240,6 +240,25 @@ pub struct ProcessHealth {
     pub network_refusals: NetworkRefusals,
 }
 
+/// The standby of a process: who waits for its role now, and how often one has taken the role over.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[repr(C)]
+pub struct StandbyRecord {
+    /// The process id of the standby that waits; 0 if none does.
+    pub pid: u64,
+    /// When it last checked whether the role is free.
+    #[serde(skip)]
+    pub alive_at: MonotonicNs,
+    /// How often a standby has taken the role over.
+    pub take_overs: u64,
+    /// When that last happened.
+    #[serde(skip)]
+    pub taken_over_at: MonotonicNs,
+    /// How long it took: from the end of the former process to the first turn of the next one, in
+    /// nanoseconds.
+    pub took_ns: u64,
+}
+
 /// The policy of one lane on the policy board: control's decision, the floor of the safety supervisor and an
 /// operator's override. Each part has its own writer, which leaves the other parts unchanged.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -35,7 +35,7 @@ pub use drops::{DropCounts, DropReason};
 pub use hash::fnv1a;
 pub use health::{
     FixedText, IngressCounters, LaneCounters, LanePolicy, LatencyHistogram, MAX_PUBLISHERS, ProcessHealth,
-    PublisherAccount, RouteInfo,
+    PublisherAccount, RouteInfo, StandbyRecord,
 };
 pub use identity::{EndpointIdentity, ProcessIdentity};
 pub use modes::{LaneMode, ModeReason, SafetyMode, SubscriberState, TrafficClass, UnmatchedPolicy};

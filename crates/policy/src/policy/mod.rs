@@ -6,6 +6,7 @@ mod absences;
 mod classifier;
 mod clock_offset;
 mod cut_through;
+mod fencing;
 mod intruders;
 mod lane;
 mod lane_mode;
@@ -31,6 +32,7 @@ pub use classifier::{
 };
 pub use clock_offset::ClockOffset;
 pub use cut_through::{MIN_CUT_THROUGH_BYTES, begins_early, step_bytes};
+pub use fencing::may_fence;
 pub use intruders::{
     Guarded, GuardedTopic, Intruder, IntruderEvent, IntruderWatch, MAX_GUARDED_TOPICS,
     MAX_REMEMBERED_INTRUDERS, NODE_NAME_TIMEOUT_MS, REMEMBER_MS,

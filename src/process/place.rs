@@ -1,0 +1,95 @@
+//! The place of a process in its bridge: the lock of its role, and shared memory.
+
+use tracing::info;
+
+use super::error::RoleError;
+use super::reload::{ReloadRequests, WaitingReloads};
+use super::scheduling;
+use super::standby::{Standby, TakeOver};
+use super::stop::Stop;
+use crate::config::{self, Scheduling, Settings};
+use crate::shm::{Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, root_of};
+
+/// What a process has before it opens anything of DDS.
+pub(super) struct Place {
+    pub lock: RoleLock,
+    pub node: ShmNode,
+    pub boards: Boards,
+    pub reloads: WaitingReloads,
+    /// What it has from waiting for the end of another process; `None` if it did not wait.
+    pub take_over: Option<TakeOver>,
+}
+
+impl Place {
+    /// Locks the role `name`, applies `scheduling` and attaches to shared memory.
+    ///
+    /// # Errors
+    /// Another process serves the role, or shared memory is not available.
+    pub fn take(
+        settings: &Settings,
+        requests: ReloadRequests,
+        name: &str,
+        scheduling: &Scheduling,
+    ) -> Result<Self, RoleError> {
+        // Before the scheduling, which is for the data path: the reload thread runs without it.
+        let reloads = WaitingReloads::start(requests, settings)?;
+        let lock = RoleLock::acquire(&root_of(settings), &settings.instance, name)?;
+        let (node, boards) = attach(settings, name, scheduling)?;
+        Ok(Self { lock, node, boards, reloads, take_over: None })
+    }
+
+    /// Like [`take`](Self::take), but with a `standby` a process that finds the role taken waits until the
+    /// other process ends. `None` if `stop` was requested meanwhile.
+    ///
+    /// # Errors
+    /// Without a standby another process serves the role, with one another process waits for it; or shared
+    /// memory is not available.
+    pub fn wait(
+        settings: &Settings,
+        requests: ReloadRequests,
+        role: (ProcessRole, &str),
+        scheduling: &Scheduling,
+        standby: config::Standby,
+        stop: &Stop,
+    ) -> Result<Option<Self>, RoleError> {
+        let (_, name) = role;
+        if standby == config::Standby::None {
+            return Self::take(settings, requests, name, scheduling).map(Some);
+        }
+        let mut reloads = WaitingReloads::start(requests, settings)?;
+        let root = root_of(settings);
+        let lock = match RoleLock::acquire(&root, &settings.instance, name) {
+            Ok(lock) => Some(lock),
+            Err(ShmError::AlreadyServed { .. }) => None,
+            Err(error) => return Err(error.into()),
+        };
+        let (node, boards) = attach(settings, name, scheduling)?;
+        if let Some(lock) = lock {
+            return Ok(Some(Self { lock, node, boards, reloads, take_over: None }));
+        }
+        let Some(mut waiting) = Standby::open(settings, role, &boards, stop)? else { return Ok(None) };
+        let Some(lock) = waiting.wait(settings, name, stop)? else { return Ok(None) };
+        reloads.refresh();
+        Ok(Some(Self { lock, node, boards, reloads, take_over: Some(waiting.take_over()) }))
+    }
+
+    /// The settings in force.
+    pub fn settings(&self) -> &Settings {
+        &self.reloads.in_force.settings
+    }
+}
+
+fn attach(settings: &Settings, name: &str, scheduling: &Scheduling) -> Result<(ShmNode, Boards), RoleError> {
+    scheduling::apply(scheduling);
+    let node = ShmNode::open(&root_of(settings), &settings.instance, name)?;
+    let cleaned = node.cleaned_up();
+    if cleaned.dead_processes > 0 {
+        info!(
+            dead_processes = cleaned.dead_processes,
+            not_yet = cleaned.failed,
+            "cleaned up in shared memory after processes that died"
+        );
+    }
+    let boards = node.boards(&BridgeShape::of(settings))?;
+    Ok((node, boards))
+}

@@ -1,0 +1,338 @@
+//! A warm standby: a second process of ingress or of a lane, which has started and waits until the first one
+//! ends. Then it takes the role over, without the time that a start takes.
+//!
+//! Both are the same program with the same arguments; the one that finds the role taken waits. The active
+//! process connects to the socket of the standby and sends it duplicates of its own UDP sockets, in which the
+//! kernel goes on queueing datagrams when the process ends ([`Successor`]). It keeps the connection open, so
+//! that its end wakes the standby.
+
+use std::fs;
+use std::io::{self, ErrorKind};
+use std::net::UdpSocket;
+use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::os::unix::net::UnixListener;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use nix::sys::signal::{Signal, kill};
+use nix::sys::socket::{
+    AddressFamily, Backlog, SockFlag, SockType, UnixAddr, bind, connect, getsockopt, listen, socket, sockopt,
+};
+use nix::unistd::Pid;
+use tracing::{debug, info, warn};
+
+use super::error::RoleError;
+use super::kept_sockets::{self, Request};
+use super::notify::Notifier;
+use super::stop::Stop;
+use crate::clock;
+use crate::config::Settings;
+use crate::model::{MonotonicNs, StandbyRecord};
+use crate::policy::may_fence;
+use crate::shm::{BoardWriter, Boards, ProcessRole, RoleLock, ShmError, root_of};
+use crate::telemetry::StatFile;
+
+/// How often a standby checks for a request to stop, and whether the role is free although no connection told
+/// it.
+const POLL_MS: u16 = 50;
+
+/// How often a standby checks whether the active process is stopped, which takes some 50 µs of CPU time.
+const STOPPED_POLL_MS: u16 = 12;
+
+/// Environment variable of the children of an `up` that leaves processes alone which make no progress.
+pub(super) const NO_WATCHDOG_VARIABLE: &str = "ADAPTIVE_BRIDGE_NO_WATCHDOG";
+
+/// How long a standby tries to take the role after the connection has ended: the kernel closes the files of a
+/// process one after the other, within microseconds.
+const END_MS: u64 = 100;
+const END_POLL: Duration = Duration::from_micros(100);
+
+/// How long a standby that has no sockets of the active process leaves the role to another process, which may
+/// have them from its supervisor.
+const GIVE_WAY_MS: u64 = 500;
+
+/// How long a standby waits for the place of one that has just taken the role over.
+const PLACE_MS: u64 = 5_000;
+
+/// A process that waits for a role.
+pub(super) struct Standby {
+    /// Its right to wait, which also lets it write the board.
+    lock: RoleLock,
+    board: BoardWriter<StandbyRecord>,
+    listener: UnixListener,
+    active: Option<Active>,
+    /// The sockets of the active process.
+    sockets: Vec<UdpSocket>,
+    /// Whether the active process has said that its sockets are not to be used by the next one.
+    is_taken_back: bool,
+    ended_at: MonotonicNs,
+    /// Whether it kills an active process that is stopped.
+    fences: bool,
+}
+
+/// The active process, as long as it keeps its connection open.
+struct Active {
+    connection: OwnedFd,
+    pid: Pid,
+    stat: StatFile,
+}
+
+impl Active {
+    fn of(connection: OwnedFd) -> io::Result<Self> {
+        // As the process was when it connected, so it is the one that has this end of the connection.
+        let pid = Pid::from_raw(getsockopt(&connection, sockopt::PeerCredentials)?.pid());
+        let stat = StatFile::open(pid.as_raw())?;
+        Ok(Self { connection, pid, stat })
+    }
+}
+
+/// What a standby has when it takes a role over.
+pub(super) struct TakeOver {
+    /// Held until the first turn, so that the next standby does not write the board before.
+    _lock: RoleLock,
+    board: BoardWriter<StandbyRecord>,
+    /// The sockets of the former process.
+    pub sockets: Vec<UdpSocket>,
+    ended_at: MonotonicNs,
+}
+
+impl Standby {
+    /// Takes the place of the standby of the role `name`; `None` if `stop` was requested meanwhile.
+    pub fn open(
+        settings: &Settings,
+        (role, name): (ProcessRole, &str),
+        boards: &Boards,
+        stop: &Stop,
+    ) -> Result<Option<Self>, RoleError> {
+        let (root, instance) = (root_of(settings), &settings.instance);
+        let give_up_at = clock::monotonic().plus_ms(PLACE_MS);
+        let lock = loop {
+            match RoleLock::acquire_standby(&root, instance, name) {
+                Ok(lock) => break lock,
+                Err(ShmError::AlreadyServed { .. }) if clock::monotonic() < give_up_at => {}
+                Err(error) => return Err(error.into()),
+            }
+            if stop.is_requested() {
+                return Ok(None);
+            }
+            pause(Duration::from_millis(POLL_MS.into()));
+        };
+        let listener = listen_at(&lock.standby_socket())?;
+        // Its supervisor may keep sockets of a time when this process, or the one before, had the role.
+        drop(kept_sockets::inherited());
+        kept_sockets::forget();
+        // Only now, as the one before has written the board until it gave up its place.
+        let mut board = boards.standby_writer(role);
+        board.update(|board| board.pid = std::process::id().into());
+        info!(role = name, "standby: waits until the process that serves the role ends");
+        Ok(Some(Self {
+            lock,
+            board,
+            listener,
+            active: None,
+            sockets: Vec::new(),
+            is_taken_back: false,
+            ended_at: MonotonicNs(0),
+            fences: std::env::var_os(NO_WATCHDOG_VARIABLE).is_none(),
+        }))
+    }
+
+    /// Waits until the role is free, and takes it; `None` if `stop` was requested meanwhile.
+    pub fn wait(
+        &mut self,
+        settings: &Settings,
+        name: &str,
+        stop: &Stop,
+    ) -> Result<Option<RoleLock>, RoleError> {
+        let mut notifier = Notifier::new();
+        notifier.ready();
+        let mut free_since = None;
+        let mut report_at = MonotonicNs(0);
+        while !stop.is_requested() {
+            let now = clock::monotonic();
+            if now >= report_at {
+                report_at = now.plus_ms(POLL_MS.into());
+                self.board.update(|board| board.alive_at = now);
+                notifier.feed_watchdog(now);
+                notifier.status(now, |line| *line += "standby");
+            }
+            let was_connected = self.active.is_some();
+            self.receive()?;
+            if self.active.is_some() {
+                self.fence(name);
+                continue;
+            }
+            self.ended_at = clock::monotonic();
+            let try_until = if was_connected { self.ended_at.plus_ms(END_MS) } else { self.ended_at };
+            let Some(lock) = self.take(settings, name, try_until)? else { continue };
+            let since = *free_since.get_or_insert(self.ended_at);
+            let has_sockets = !self.sockets.is_empty() || self.is_taken_back;
+            if has_sockets || self.ended_at.since(since) > GIVE_WAY_MS * 1_000_000 {
+                info!(role = name, sockets = self.sockets.len(), "standby: takes the role over");
+                return Ok(Some(lock));
+            }
+        }
+        self.board.update(|board| board.pid = 0);
+        Ok(None)
+    }
+
+    /// Waits for a connection, or for a message of the one that there is.
+    fn receive(&mut self) -> io::Result<()> {
+        let (source, timeout_ms) = match &self.active {
+            Some(active) => (active.connection.as_fd(), STOPPED_POLL_MS),
+            None => (self.listener.as_fd(), POLL_MS),
+        };
+        let mut polled = [PollFd::new(source, PollFlags::POLLIN)];
+        match poll(&mut polled, PollTimeout::from(timeout_ms)) {
+            Ok(0) | Err(nix::Error::EINTR) => return Ok(()),
+            Err(error) => return Err(error.into()),
+            Ok(_) => {}
+        }
+        let Some(active) = &self.active else {
+            match self.listener.accept().and_then(|(connection, _)| Active::of(connection.into())) {
+                Ok(active) => self.active = Some(active),
+                Err(error) => warn!(%error, "standby: a connection of the active process failed"),
+            }
+            return Ok(());
+        };
+        match kept_sockets::receive(&active.connection) {
+            Some(Request::Store(sockets)) => (self.sockets, self.is_taken_back) = (sockets, false),
+            Some(Request::Forget) => {
+                self.sockets.clear();
+                self.is_taken_back = true;
+            }
+            Some(Request::Unknown) | None => self.active = None,
+        }
+        Ok(())
+    }
+
+    /// Kills the active process if a signal has stopped it: continued later, it would be a second speaker
+    /// with the same identity.
+    fn fence(&mut self, name: &str) {
+        let Some(active) = &self.active else { return };
+        let may_fence = || may_fence(self.board.get().taken_over_at, clock::monotonic());
+        if !self.fences || !active.stat.is_stopped() || !may_fence() {
+            return;
+        }
+        warn!(role = name, pid = active.pid.as_raw(), "standby: kills the active process, which is stopped");
+        if let Err(error) = kill(active.pid, Signal::SIGKILL) {
+            warn!(role = name, %error, "standby: cannot kill the active process");
+        }
+    }
+
+    /// Takes the role if it becomes free until then; tries at least once.
+    fn take(
+        &self,
+        settings: &Settings,
+        name: &str,
+        until: MonotonicNs,
+    ) -> Result<Option<RoleLock>, RoleError> {
+        loop {
+            match RoleLock::acquire(&root_of(settings), &settings.instance, name) {
+                Ok(lock) => return Ok(Some(lock)),
+                Err(ShmError::AlreadyServed { .. }) => {}
+                Err(error) => return Err(error.into()),
+            }
+            if clock::monotonic() >= until {
+                return Ok(None);
+            }
+            pause(END_POLL);
+        }
+    }
+
+    pub fn take_over(self) -> TakeOver {
+        let Self { lock, board, sockets, ended_at, .. } = self;
+        TakeOver { _lock: lock, board, sockets, ended_at }
+    }
+}
+
+impl TakeOver {
+    /// Records that the process has completed its first turn; then another one may wait for the role.
+    pub fn complete(mut self) {
+        let now = clock::monotonic();
+        let took_ns = now.since(self.ended_at);
+        self.board.update(|board| {
+            *board = StandbyRecord {
+                take_overs: board.take_overs + 1,
+                taken_over_at: now,
+                took_ns,
+                ..StandbyRecord::default()
+            };
+        });
+        info!(took_ms = took_ns as f64 / 1e6, "standby: has taken the role over");
+    }
+}
+
+#[allow(clippy::disallowed_methods, reason = "a standby handles no samples")]
+fn pause(time: Duration) {
+    std::thread::sleep(time);
+}
+
+fn listen_at(path: &Path) -> io::Result<UnixListener> {
+    // One that a former standby has left; this process has the right to wait.
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+        _ => {}
+    }
+    let listener = open_socket()?;
+    bind(listener.as_raw_fd(), &UnixAddr::new(path)?)?;
+    listen(&listener, Backlog::new(1)?)?;
+    Ok(listener.into())
+}
+
+/// A socket that keeps the bounds of messages, and never blocks.
+fn open_socket() -> nix::Result<OwnedFd> {
+    let flags = SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK;
+    socket(AddressFamily::Unix, SockType::SeqPacket, flags, None)
+}
+
+/// Sends the sockets of this process to its standby, as soon as there is one.
+pub(super) struct Successor {
+    path: PathBuf,
+    sockets: Vec<UdpSocket>,
+    connection: Option<OwnedFd>,
+}
+
+impl Successor {
+    /// `path` is the socket of the standby.
+    pub fn new(path: PathBuf, sockets: Vec<UdpSocket>) -> Self {
+        Self { path, sockets, connection: None }
+    }
+
+    /// Connects to a standby that has none of the sockets. Never waits; some 5 µs without a standby.
+    pub fn housekeeping(&mut self) {
+        if self.connection.as_ref().is_some_and(has_ended) {
+            self.connection = None;
+        }
+        if self.connection.is_some() || self.sockets.is_empty() {
+            return;
+        }
+        match self.connect() {
+            Ok(connection) => self.connection = Some(connection),
+            Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::ConnectionRefused) => {}
+            Err(error) => debug!(%error, "cannot send the sockets to the standby"),
+        }
+    }
+
+    fn connect(&self) -> io::Result<OwnedFd> {
+        let connection = open_socket()?;
+        connect(connection.as_raw_fd(), &UnixAddr::new(&self.path)?)?;
+        kept_sockets::hand_over(connection.as_fd(), &self.sockets)?;
+        Ok(connection)
+    }
+
+    /// Makes the standby close the sockets: it will be another participant.
+    pub fn end(&mut self) {
+        self.sockets.clear();
+        if let Some(connection) = &self.connection {
+            kept_sockets::take_back(connection.as_fd());
+        }
+    }
+}
+
+/// Whether the other end of a connection, which sends nothing, is closed.
+fn has_ended(connection: &OwnedFd) -> bool {
+    let mut polled = [PollFd::new(connection.as_fd(), PollFlags::POLLIN)];
+    poll(&mut polled, PollTimeout::ZERO).is_ok_and(|ready| ready > 0)
+}
