@@ -125,7 +125,11 @@ pub fn up(
         let second = (standby == Standby::Warm).then(|| format!("{role}-2"));
         for name in [Some(role.to_owned()), second].into_iter().flatten() {
             let child = Supervised::new(&name, own, arguments, &folder, HANG_CRITICAL_MS);
-            children.push(Supervised { role: role.to_owned(), ..child.keep_sockets() });
+            let backoff = match standby {
+                Standby::None => child.backoff,
+                Standby::Warm => RestartBackoff::with_standby(clock::monotonic()),
+            };
+            children.push(Supervised { role: role.to_owned(), backoff, ..child.keep_sockets() });
         }
     };
     add_kept("ingress", &["ingress"], settings.ingress_standby);

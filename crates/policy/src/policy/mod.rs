@@ -46,8 +46,8 @@ pub use probe_window::{LinkReading, MAX_OUTSTANDING, ProbeTotals, ProbeWindow, R
 pub use publisher_places::{PUBLISHER_SILENT_MS, publisher_place};
 pub use replay_guard::{Admission, IDLE_SENDER_MS, ReplayGuard, SenderLimits};
 pub use restart::{
-    ChildExit, FIRST_BACKOFF_MS, GiveUpReason, HEALTHY_RUN_MS, HangWatch, MAX_BACKOFF_MS, RestartBackoff,
-    RestartDecision,
+    ChildExit, FIRST_BACKOFF_MS, GiveUpReason, HEALTHY_RUN_MS, HEALTHY_RUN_WITH_STANDBY_MS, HangWatch,
+    MAX_BACKOFF_MS, RestartBackoff, RestartDecision,
 };
 pub use route_places::{AWAY_MS, Binding, MAX_TOPIC_WRITERS, MAX_WAITING_TOPICS, RoutePlaces, TRIAL_MS};
 pub use safety::{

@@ -14,6 +14,10 @@ pub const MAX_BACKOFF_MS: u64 = 5_000;
 /// that a child which dies shortly after each start does not count as healthy.
 pub const HEALTHY_RUN_MS: u64 = 10_000;
 
+/// The same for a child with a standby: until it runs again, the other one has no standby, so that the waits
+/// of a child that is killed now and then cost samples. Longer than a child that dies at each start runs.
+pub const HEALTHY_RUN_WITH_STANDBY_MS: u64 = 1_500;
+
 /// How a child process ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChildExit {
@@ -41,10 +45,12 @@ pub enum RestartDecision {
     GiveUp(GiveUpReason),
 }
 
-/// The restart waits of one child: 0, 100, 200, … 5,000 ms, and again after a run of [`HEALTHY_RUN_MS`].
+/// The restart waits of one child: 0, 100, 200, … 5,000 ms, and again after a run of [`HEALTHY_RUN_MS`], or
+/// of [`HEALTHY_RUN_WITH_STANDBY_MS`].
 #[derive(Clone, Copy, Debug)]
 pub struct RestartBackoff {
     started_at: MonotonicNs,
+    healthy_run_ms: u64,
     /// 0 when the next restart is immediate.
     next_wait_ms: u64,
 }
@@ -52,7 +58,12 @@ pub struct RestartBackoff {
 impl RestartBackoff {
     /// The waits of a child that is started at `now`.
     pub const fn new(now: MonotonicNs) -> Self {
-        Self { started_at: now, next_wait_ms: 0 }
+        Self { started_at: now, healthy_run_ms: HEALTHY_RUN_MS, next_wait_ms: 0 }
+    }
+
+    /// The waits of a child with a standby that is started at `now`.
+    pub const fn with_standby(now: MonotonicNs) -> Self {
+        Self { healthy_run_ms: HEALTHY_RUN_WITH_STANDBY_MS, ..Self::new(now) }
     }
 
     /// Records that the child was restarted at `now`.
@@ -68,7 +79,7 @@ impl RestartBackoff {
             ChildExit::Code(78) => return RestartDecision::GiveUp(GiveUpReason::BadConfiguration),
             ChildExit::Code(_) | ChildExit::Signal(_) => {}
         }
-        if now.since(self.started_at) >= HEALTHY_RUN_MS * 1_000_000 {
+        if now.since(self.started_at) >= self.healthy_run_ms * 1_000_000 {
             self.next_wait_ms = 0;
         }
         let wait_ms = self.next_wait_ms;
@@ -164,6 +175,14 @@ mod tests {
         assert_eq!(wait_ms(&mut backoff, &mut now, HEALTHY_RUN_MS - 1), 1_600);
         assert_eq!(wait_ms(&mut backoff, &mut now, HEALTHY_RUN_MS), 0);
         assert_eq!(wait_ms(&mut backoff, &mut now, 1), 100);
+    }
+
+    #[test]
+    fn a_child_with_a_standby_needs_a_shorter_good_run() {
+        let mut now = MonotonicNs(0);
+        let mut backoff = RestartBackoff::with_standby(now);
+        let waits = [1, HEALTHY_RUN_WITH_STANDBY_MS - 1, HEALTHY_RUN_WITH_STANDBY_MS, 1];
+        assert_eq!(waits.map(|run_ms| wait_ms(&mut backoff, &mut now, run_ms)), [0, 100, 0, 100]);
     }
 
     #[test]
