@@ -38,14 +38,14 @@ fn wait_standby(bed: &Bed, name: &str) -> i32 {
     i32::try_from(number(&process(&status, name)["pid"])).unwrap()
 }
 
-/// The longest pause between two samples from the one with that index on, in ms.
-fn longest_pause_ms(subscriber: &RunningPeer, first: usize) -> f64 {
+/// The pauses between two samples from the one with that index on, in ms.
+fn pauses_ms(subscriber: &RunningPeer, first: usize) -> Vec<f64> {
     let events = subscriber.events().into_iter().filter(|event| event["event"] == "sample").skip(first);
     let at_ms = |event: Value| {
         number(&event["seq"]) as f64 * 1e3 / RATE_HZ + event["latency_us"].as_f64().unwrap() / 1e3
     };
     let times: Vec<f64> = events.map(at_ms).collect();
-    times.windows(2).map(|pair| pair[1] - pair[0]).fold(0.0, f64::max)
+    times.windows(2).map(|pair| pair[1] - pair[0]).collect()
 }
 
 #[test]
@@ -96,7 +96,7 @@ fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
         });
         all_receive(100);
         let took_ms = number(&process(&status, name)["standby"]["took_ns"]) as f64 / 1e6;
-        let pause_ms = longest_pause_ms(watched, before.saturating_sub(10));
+        let pause_ms = pauses_ms(watched, before.saturating_sub(10)).into_iter().fold(0.0, f64::max);
         println!("{name}, {sent}: taken over in {took_ms:.1} ms, longest pause {pause_ms:.1} ms");
     }
     // A process that was stopped and continued late must not speak with the identity of the active one.
@@ -121,4 +121,111 @@ fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
         assert!(received.missing_count <= most, "{name}: {received:?}");
     }
     bed.end();
+}
+
+/// Tests of a minute or more: `make test-long`.
+mod long {
+    use std::time::Instant;
+
+    use nix::sys::signal::kill;
+    use nix::unistd::Pid;
+
+    use super::super::hostile::Random;
+    use super::*;
+
+    /// How long processes are killed and stopped, in seconds; an hour in `make soak`.
+    const SECONDS: u64 = 60;
+    const SECONDS_VARIABLE: &str = "ADAPTIVE_BRIDGE_TEST_HITLESS_S";
+
+    const IMAGE: &str = "  - {id: image, input_topic: /image, message_type: sensor_msgs/msg/LaserScan, \
+                         max_sample_bytes: 2000000}\n";
+    const IMAGE_BYTES: usize = 1 << 20;
+
+    /// Each 2 to 10 s a process of the bridge, active or standby, is killed, or stopped and continued late.
+    #[test]
+    fn no_subscriber_notices_that_any_process_is_killed_or_stopped() {
+        let test = "no_subscriber_notices_that_any_process_is_killed_or_stopped";
+        let _alone = support::exclusive();
+        let Some(bed) = Bed::start(test, &format!("{SCAN}{IMAGE}{STANDBYS}")) else { return };
+        let mut peers =
+            vec![("Fast DDS", Peer::fast().keep_all()), (WATCHED, Peer::cyclone().keep_all().each_sample())];
+        if ros::missing().is_none() {
+            peers.push(("rclpy", Peer::rclpy("planner").keep_last(1_000)));
+        }
+        let scans = peers.into_iter().map(|(name, peer)| (name, bed.subscribe("critical", peer, CRITICAL)));
+        let image = |peer: Peer| peer.keep_all().size(IMAGE_BYTES).large_socket_buffers();
+        let out = "rt/adaptive_bridge/critical/image";
+        let images = [("Fast DDS, 1 MiB", Peer::fast()), ("Cyclone DDS, 1 MiB", Peer::cyclone())];
+        let images = images.map(|(name, peer)| (name, bed.subscribe("critical", image(peer), out)));
+        let subscribers: Vec<_> = scans.chain(images).collect();
+        let publishers = [
+            bed.publish(Peer::cyclone().keep_all().rate_hz(RATE_HZ), INPUT),
+            bed.publish(image(Peer::cyclone()).rate_hz(30.0), "rt/image"),
+        ];
+        for (_, subscriber) in &subscribers {
+            subscriber.wait_received(50);
+        }
+
+        let seconds = std::env::var(SECONDS_VARIABLE).map_or(SECONDS, |text| text.parse().unwrap());
+        let mut random = Random(u64::from(std::process::id()) | 1);
+        println!("seed {}", random.0);
+        let until = Instant::now() + Duration::from_secs(seconds);
+        let mut faults = [0; 2];
+        while Instant::now() < until {
+            std::thread::sleep(Duration::from_millis(2_000 + random.below(8_000) as u64));
+            let status = bed.bridge.status();
+            let pids: Vec<u64> = status["processes"]
+                .as_array()
+                .unwrap()
+                .iter()
+                .flat_map(|process| [number(&process["pid"]), number(&process["standby"]["pid"])])
+                .filter(|pid| *pid != 0)
+                .collect();
+            let pid = Pid::from_raw(i32::try_from(pids[random.below(pids.len())]).unwrap());
+            let is_stop = random.below(4) == 0;
+            faults[usize::from(is_stop)] += 1;
+            // It may have ended already.
+            let _ = kill(pid, if is_stop { Signal::SIGSTOP } else { Signal::SIGKILL });
+            if is_stop {
+                std::thread::sleep(Duration::from_millis(random.below(4_000) as u64));
+                let _ = kill(pid, Signal::SIGCONT);
+            }
+        }
+        println!("{} killed, {} stopped", faults[0], faults[1]);
+        for (_, subscriber) in &subscribers {
+            subscriber.wait_received(subscriber.received() + 50);
+        }
+        let sent = publishers.map(|publisher| {
+            let sent: Sent = publisher.end();
+            sent.assert_not_blocked();
+            println!("longest write {:.1} ms", sent.call_us.map_or(0.0, |calls| calls.max / 1e3));
+            sent
+        });
+        bed.wait_accounted();
+        for (name, subscriber) in subscribers {
+            let sent = &sent[usize::from(name.ends_with("MiB"))];
+            subscriber
+                .wait_for("the last sample", |event| event["last"] == sent.last || event["seq"] == sent.last);
+            if name == WATCHED {
+                println!("{}", pauses(&subscriber));
+            }
+            let matches = subscriber.matches();
+            let received: Received = subscriber.end();
+            println!(
+                "{name}: matched, unmatched {matches:?}; of {}: {} missing, {} twice, longest gap {:.0} ms",
+                sent.ok, received.missing_count, received.duplicates, received.max_gap_ms
+            );
+            assert_eq!(matches, (1, 0), "{name}");
+            received.assert_all_of(sent);
+        }
+        bed.end();
+    }
+
+    /// The distribution of the pauses between two samples.
+    fn pauses(subscriber: &RunningPeer) -> String {
+        let mut pauses = pauses_ms(subscriber, 0);
+        pauses.sort_by(f64::total_cmp);
+        let at = |part: f64| pauses[((pauses.len() - 1) as f64 * part) as usize];
+        format!("pauses: p99 {:.1}, p99.9 {:.1}, max {:.1} ms", at(0.99), at(0.999), at(1.0))
+    }
 }
