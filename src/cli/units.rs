@@ -9,7 +9,8 @@ use std::process::ExitCode;
 use clap::Args;
 
 use super::{ConfigArguments, EXIT_USAGE, failed, print};
-use crate::config::{self, MetricsListener, Scheduling, SchedulingPolicy, SecretSource, Settings};
+use crate::config::Lane;
+use crate::config::{self, MetricsListener, Scheduling, SchedulingPolicy, SecretSource, Settings, Standby};
 use crate::model::TrafficClass;
 use crate::process::MemoryNeeds;
 
@@ -18,6 +19,13 @@ pub(super) const FOLDER: &str = "/etc/systemd/system";
 
 const INGRESS: &str = "adaptive-bridge-ingress.service";
 const CONTROL: &str = "adaptive-bridge-control.service";
+
+/// The services of the standbys, which the target starts only if the configuration has standbys.
+const INGRESS_STANDBY: &str = "adaptive-bridge-standby-ingress.service";
+const CRITICAL_STANDBY: &str = "adaptive-bridge-standby-critical.service";
+
+/// Lets a standby see whether the active process, which has a user namespace of its own, is stopped.
+const SEE_PROCESSES: &str = "ProtectProc=default";
 
 /// The first line of each written drop-in, by which a later run recognises it.
 const HEADER: &str =
@@ -81,10 +89,21 @@ pub(super) fn memory_limits(settings: &Settings) -> BTreeMap<String, u64> {
     let mut limits = BTreeMap::from_iter(of_lanes);
     limits.insert(INGRESS.to_owned(), needs.ingress.limit_bytes());
     limits.insert(CONTROL.to_owned(), needs.control.limit_bytes());
+    for (unit, standby) in standbys(settings) {
+        limits.insert(standby.to_owned(), limits[&unit]);
+    }
     if !noncritical.is_empty() {
         limits.insert(NONCRITICAL_SLICE.to_owned(), noncritical.into_iter().fold(0, u64::saturating_add));
     }
     limits
+}
+
+/// The services that have a standby, each with that of the standby.
+fn standbys(settings: &Settings) -> Vec<(String, &'static str)> {
+    let warm = |lane: &&Lane| lane.standby == Standby::Warm && lane.is_used();
+    let lanes = settings.lanes.iter().filter(warm);
+    let ingress = (settings.ingress_standby == Standby::Warm).then(|| (INGRESS.to_owned(), INGRESS_STANDBY));
+    ingress.into_iter().chain(lanes.map(|lane| (egress(lane.name.as_str()), CRITICAL_STANDBY))).collect()
 }
 
 /// The drop-ins that a configuration needs, by unit.
@@ -102,7 +121,9 @@ impl DropIns {
         };
         let installed = ["critical", "noncritical"];
         let lanes = settings.lanes.iter().filter(|lane| !installed.contains(&lane.name.as_str()));
+        let standbys = standbys(settings);
         let wants = lanes.map(|lane| format!("Wants={}", egress(lane.name.as_str())));
+        let wants = wants.chain(standbys.iter().map(|(_, standby)| format!("Wants={standby}")));
         add("adaptive-bridge.target".to_owned(), "Unit", wants.collect());
 
         let limits = memory_limits(settings);
@@ -113,9 +134,16 @@ impl DropIns {
         }
         let common = common(settings, config);
         let mut service = |unit: String, configured: &Scheduling, critical: bool, own: Option<String>| {
+            let standby =
+                standbys.iter().find(|(of, _)| *of == unit).map(|(_, standby)| (*standby).to_owned());
             let limit = limits.get(&unit).map(|bytes| memory_max(*bytes));
-            let own = own.into_iter().chain(limit).collect();
-            add(unit, "Service", [common.clone(), scheduling(configured, critical), own].concat());
+            let sees = standby.is_some().then(|| SEE_PROCESSES.to_owned());
+            let own = own.into_iter().chain(sees).chain(limit).collect();
+            let lines = [common.clone(), scheduling(configured, critical), own].concat();
+            // Either of the two may have the role.
+            for unit in [unit].into_iter().chain(standby) {
+                add(unit, "Service", lines.clone());
+            }
         };
         service(INGRESS.to_owned(), &settings.ingress_scheduling, true, None);
         for lane in &settings.lanes {
@@ -343,6 +371,20 @@ mod tests {
             ["LimitRTPRIO=7", "RestrictRealtime=no", "LimitRTTIME=500ms:1s", "LimitMEMLOCK=infinity"];
         assert_eq!(lines(&egress("noncritical"))[4..], real_time);
         assert_eq!(lines("adaptive-bridge-control.service")[4..], [r#"ReadWritePaths="/run/metrics""#]);
+    }
+
+    #[test]
+    fn a_standby_is_started_and_has_what_the_service_has() {
+        let warm = format!("{PLAIN}lanes: {{critical: {{standby: warm}}}}\n");
+        let drop_ins = DropIns::of(&settings(&warm), Path::new("/srv/bridge.yaml")).0;
+        let target = &drop_ins["adaptive-bridge.target"];
+        assert!(target.ends_with("[Unit]\nWants=adaptive-bridge-standby-critical.service\n"), "{target}");
+        let [standby, critical] = [CRITICAL_STANDBY, &egress("critical")].map(|unit| &drop_ins[unit]);
+        assert_eq!(standby, critical);
+        for line in ["Environment=", SEE_PROCESSES, "MemoryMax="] {
+            assert!(standby.contains(line), "{standby}");
+        }
+        assert!(!drop_ins.contains_key(INGRESS_STANDBY) && !drop_ins[INGRESS].contains(SEE_PROCESSES));
     }
 
     #[test]

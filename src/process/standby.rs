@@ -75,15 +75,20 @@ pub(super) struct Standby {
 struct Active {
     connection: OwnedFd,
     pid: Pid,
-    stat: StatFile,
+    /// `None` where this process cannot see it.
+    stat: Option<StatFile>,
 }
 
 impl Active {
     fn of(connection: OwnedFd) -> io::Result<Self> {
         // As the process was when it connected, so it is the one that has this end of the connection.
         let pid = Pid::from_raw(getsockopt(&connection, sockopt::PeerCredentials)?.pid());
-        let stat = StatFile::open(pid.as_raw())?;
-        Ok(Self { connection, pid, stat })
+        let stat = StatFile::open(pid.as_raw());
+        if let Err(error) = &stat {
+            // systemd hides it without ProtectProc=default, which `adaptive-bridge units` writes.
+            warn!(%pid, %error, "standby: cannot see whether the active process is stopped");
+        }
+        Ok(Self { connection, pid, stat: stat.ok() })
     }
 }
 
@@ -211,8 +216,9 @@ impl Standby {
     /// with the same identity.
     fn fence(&mut self, name: &str) {
         let Some(active) = &self.active else { return };
+        let is_stopped = active.stat.as_ref().is_some_and(StatFile::is_stopped);
         let may_fence = || may_fence(self.board.get().taken_over_at, clock::monotonic());
-        if !self.fences || !active.stat.is_stopped() || !may_fence() {
+        if !self.fences || !is_stopped || !may_fence() {
             return;
         }
         warn!(role = name, pid = active.pid.as_raw(), "standby: kills the active process, which is stopped");

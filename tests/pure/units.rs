@@ -13,8 +13,12 @@ fn settings(file: &str) -> BTreeSet<String> {
 
 const COMMON: &str = "adaptive-bridge-.service.d/10-common.conf";
 /// The services of ingress and of the critical lane.
-const CRITICAL: [&str; 2] =
-    ["adaptive-bridge-ingress.service", "adaptive-bridge-egress@critical.service.d/50-critical.conf"];
+const CRITICAL: [&str; 4] = [
+    "adaptive-bridge-ingress.service",
+    "adaptive-bridge-egress@critical.service.d/50-critical.conf",
+    "adaptive-bridge-standby-ingress.service",
+    "adaptive-bridge-standby-critical.service",
+];
 const OTHERS: [&str; 4] = [
     COMMON,
     "adaptive-bridge-control.service",
@@ -74,6 +78,18 @@ fn only_ingress_and_the_critical_lane_may_use_real_time_scheduling_and_lock_memo
             assert!(!grants.iter().any(|grant| setting.starts_with(grant)), "{setting} in {unit}");
         }
     }
+}
+
+/// Either of the two processes of a role may serve it.
+#[test]
+fn a_standby_has_the_settings_of_the_service_that_it_takes_over_from() {
+    let service = |unit: &str| {
+        let of_unit = ["Description=", "Documentation=", "PartOf=", "After=", "ExecStart="];
+        let settings = settings(unit).into_iter();
+        settings.filter(|line| !of_unit.iter().any(|name| line.starts_with(name))).collect::<BTreeSet<_>>()
+    };
+    let [ingress, critical, of_ingress, of_critical] = CRITICAL.map(service);
+    assert_eq!((ingress, critical), (of_ingress, of_critical));
 }
 
 #[test]

@@ -19,6 +19,8 @@ const EGRESS_CRITICAL: &str = "adaptive-bridge-egress@critical.service";
 const EGRESS_NONCRITICAL: &str = "adaptive-bridge-egress@noncritical.service";
 const CONTROL: &str = "adaptive-bridge-control.service";
 const UNITS: [&str; 4] = [INGRESS, EGRESS_CRITICAL, EGRESS_NONCRITICAL, CONTROL];
+const STANDBYS: [&str; 2] =
+    ["adaptive-bridge-standby-ingress.service", "adaptive-bridge-standby-critical.service"];
 const RESPONDER: &str = "adaptive-bridge-responder@laptop.service";
 
 const CONFIG: &str = "/etc/adaptive-bridge/config.yaml";
@@ -156,10 +158,11 @@ fn the_units_are_sound_and_hardened() {
         let printed = [output.stdout, output.stderr].concat();
         assert!(output.status.success(), "{command:?}\n{}", String::from_utf8_lossy(&printed));
     };
-    for unit in UNITS.into_iter().chain([RESPONDER]) {
+    for unit in UNITS.into_iter().chain(STANDBYS).chain([RESPONDER]) {
         analyze(&["security", "--offline=true", MAX_EXPOSURE], unit);
     }
-    for unit in UNITS.into_iter().chain([RESPONDER, TARGET, "adaptive-bridge-critical.slice"]) {
+    for unit in UNITS.into_iter().chain(STANDBYS).chain([RESPONDER, TARGET, "adaptive-bridge-critical.slice"])
+    {
         analyze(&["verify", "--recursive-errors=one", "--man=no"], unit);
     }
 }
@@ -204,6 +207,49 @@ fn a_killed_or_stopped_unit_is_restarted_and_delays_no_other() {
     }
     flow.end();
     bed.machine.run(&["systemctl", "stop", RESPONDER]);
+    bed.stop();
+}
+
+/// Either unit of a role may have it: the one that finds it taken waits.
+#[test]
+fn a_standby_takes_over_from_a_killed_or_stopped_unit() {
+    let test = "a_standby_takes_over_from_a_killed_or_stopped_unit";
+    let yaml =
+        format!("{SCAN}lanes: {{critical: {{standby: warm}}}}\nprocesses: {{ingress: {{standby: warm}}}}\n");
+    let Some(bed) = Bed::boot(test, &yaml) else { return };
+    bed.machine.run(&["adaptive-bridge", "units", "--write"]);
+    bed.machine.run(&["systemctl", "daemon-reload"]);
+    bed.start();
+    for standby in STANDBYS {
+        bed.machine.wait_property(standby, "ActiveState", "active");
+    }
+    let process = |name: &str| -> Option<Value> {
+        let status = bed.machine.try_status()?;
+        status["processes"].as_array()?.iter().find(|process| process["name"] == name).cloned()
+    };
+    let flow = bed.flow();
+    let mut take_overs = 0;
+    for signal in ["KILL", "STOP", "KILL"] {
+        take_overs += 1;
+        for name in ["egress-critical", "ingress"] {
+            let active = support::wait_for(format!("a standby of {name}"), || {
+                let process = process(name).filter(|process| process["standby"]["pid"] != 0)?;
+                Some(process["pid"].to_string())
+            });
+            // See the test above. A standby has the sockets of the active process after 0.1 s.
+            std::thread::sleep(Duration::from_millis(1_500));
+            bed.machine.run(&["kill", "-s", signal, &active]);
+            let took = support::wait_for(format!("take-over {take_overs} of {name}"), || {
+                let standby = &process(name)?["standby"];
+                (standby["take_overs"] == take_overs).then(|| standby["took_ns"].clone())
+            });
+            println!("{name}, SIG{signal}: taken over in {took} ns");
+            flow.wait_on();
+        }
+    }
+    assert_eq!(flow.critical.matches(), (1, 0));
+    let (sent, received) = flow.end();
+    assert_eq!((received.missing_count, received.received), (0, sent.ok), "{received:?}");
     bed.stop();
 }
 

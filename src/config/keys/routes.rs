@@ -244,7 +244,7 @@ pub(super) const ROWS: &[Row] = &[
         .doc("Lock the memory of the process (`mlockall`), so that it has no page faults."),
     restarts(&["lanes.<lane>.standby", "processes.ingress.standby"], Choice(words::<Standby>), "`none`").doc(
         "`warm`: a second process of the critical lane, or of ingress, waits and takes over when the first one \
-         ends, without the time that a start takes. Started by `up` only.",
+         ends, without the time that a start takes. systemd starts it after `units --write`.",
     ),
     restarts(&["shared_memory.root_path"], Other("absolute path"), "chosen by the program")
         .doc("Folder of the bridge's own files."),
