@@ -63,6 +63,10 @@ const UNSENT_POLL_NS: u64 = 250_000;
 /// whether ingress has delivered the samples of the former process.
 const HOLD_POLL_MS: u64 = 1;
 
+/// How often a lane that catches up checks whether readers have acknowledged the samples before. In the time
+/// between two checks the subscribers take what was sent.
+const PACE_POLL_MS: u64 = 5;
+
 /// What the lane does after a turn.
 enum Turn {
     /// Take another turn at once: samples were handled, and more may wait.
@@ -282,8 +286,10 @@ impl Egress {
         if self.count_sent() {
             until = MonotonicNs(until.0.min(now.plus_ns(UNSENT_POLL_NS).0));
         }
-        if self.outputs.iter().any(|output| output.is_waiting() || output.collects_former()) {
+        if self.outputs.iter().any(|output| output.is_held() || output.collects_former()) {
             until = MonotonicNs(until.0.min(now.plus_ms(HOLD_POLL_MS).0));
+        } else if self.outputs.iter().any(Output::is_paced) {
+            until = MonotonicNs(until.0.min(now.plus_ms(PACE_POLL_MS).0));
         }
         let wait_ns = until.since(now);
         if wait_ns == 0 {

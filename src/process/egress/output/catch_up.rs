@@ -49,14 +49,19 @@ impl Output {
         let is_behind = |reader: ReaderRecord| reader.reliable == 1 && reader.unacknowledged >= most as u64;
         let has_slow_reader = |writer: &RawWriter| writer.matched_readers().any(is_behind);
         self.is_paced = self.history.is_none()
-            && self.former_readers.may_hold(clock::monotonic())
+            && self.former_readers.may_pace(clock::monotonic())
             && (self.unsent.len() >= most || self.writer.as_ref().is_some_and(has_slow_reader));
         self.is_paced
     }
 
-    /// Whether samples wait for former readers, or for acknowledgements.
-    pub const fn is_waiting(&self) -> bool {
-        self.is_held || self.is_paced
+    /// Whether samples wait for former readers.
+    pub const fn is_held(&self) -> bool {
+        self.is_held
+    }
+
+    /// Whether samples wait for acknowledgements.
+    pub const fn is_paced(&self) -> bool {
+        self.is_paced
     }
 
     /// Whether matched readers lack samples of the former process that are not counted yet. The library sends

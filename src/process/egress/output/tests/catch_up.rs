@@ -56,10 +56,10 @@ fn samples_that_waited_for_a_lane_wait_until_those_before_are_sent() {
     for number in 1..=most {
         output.unsent.push(unsent(number));
     }
-    assert!(output.take().is_none() && output.is_waiting());
+    assert!(output.take().is_none() && output.is_paced());
     output.unsent.pop_sent(1);
     assert_eq!(take_all(&mut output), [1]);
-    assert!(!output.is_waiting());
+    assert!(!output.is_paced());
     // Not for longer than former readers are waited for, and not once it has caught up.
     output.unsent.push(unsent(most + 1));
     host.publish_next(2);
