@@ -6,6 +6,7 @@
 //! would announce something else. Then it is disposed of, as without an identity.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::io;
 
 use tracing::{info, warn};
 
@@ -115,15 +116,16 @@ impl Identity {
             None => open(kept)?,
         };
         role.record_participant(&participant);
-        let stored =
-            participant.sockets().and_then(|sockets| kept_sockets::store(&sockets).map(|()| sockets));
-        match stored {
-            Ok(sockets) => identity.successor = (standby == Standby::Warm).then(|| role.successor(sockets)),
-            Err(error) => warn!(
-                role = name,
-                %error,
-                "the sockets are not kept; after a kill, what arrives meanwhile is lost"
-            ),
+        let not_kept = |error: &io::Error| {
+            warn!(role = name, %error, "the sockets are not kept; after a kill, what arrives meanwhile is lost");
+        };
+        match participant.sockets() {
+            Ok(sockets) => {
+                let _ = kept_sockets::store(&sockets).inspect_err(not_kept);
+                // Also if the supervisor does not keep them.
+                identity.successor = (standby == Standby::Warm).then(|| role.successor(sockets));
+            }
+            Err(error) => not_kept(&error),
         }
         let unproven = if continued { identity.board.get().unproven } else { 0 };
         identity.record(&participant, unproven);

@@ -5,7 +5,7 @@ use tracing::info;
 use super::error::RoleError;
 use super::reload::{ReloadRequests, WaitingReloads};
 use super::scheduling;
-use super::standby::{Standby, TakeOver};
+use super::standby::{TakeOver, Waiting};
 use super::stop::Stop;
 use crate::config::{self, Scheduling, Settings};
 use crate::shm::{Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, root_of};
@@ -53,21 +53,16 @@ impl Place {
         stop: &Stop,
     ) -> Result<Option<Self>, RoleError> {
         let (_, name) = role;
-        if standby == config::Standby::None {
-            return Self::take(settings, requests, name, scheduling).map(Some);
-        }
         let mut reloads = WaitingReloads::start(requests, settings)?;
-        let root = root_of(settings);
-        let lock = match RoleLock::acquire(&root, &settings.instance, name) {
-            Ok(lock) => Some(lock),
-            Err(ShmError::AlreadyServed { .. }) => None,
-            Err(error) => return Err(error.into()),
+        let lock = match RoleLock::acquire(&root_of(settings), &settings.instance, name) {
+            Err(ShmError::AlreadyServed { .. }) if standby == config::Standby::Warm => None,
+            lock => Some(lock?),
         };
         let (node, boards) = attach(settings, name, scheduling)?;
         if let Some(lock) = lock {
             return Ok(Some(Self { lock, node, boards, reloads, take_over: None }));
         }
-        let Some(mut waiting) = Standby::open(settings, role, &boards, stop)? else { return Ok(None) };
+        let Some(mut waiting) = Waiting::open(settings, role, &boards, stop)? else { return Ok(None) };
         let Some(lock) = waiting.wait(settings, name, stop)? else { return Ok(None) };
         reloads.refresh();
         Ok(Some(Self { lock, node, boards, reloads, take_over: Some(waiting.take_over()) }))

@@ -56,7 +56,7 @@ const GIVE_WAY_MS: u64 = 500;
 const PLACE_MS: u64 = 5_000;
 
 /// A process that waits for a role.
-pub(super) struct Standby {
+pub(super) struct Waiting {
     /// Its right to wait, which also lets it write the board.
     lock: RoleLock,
     board: BoardWriter<StandbyRecord>,
@@ -85,8 +85,13 @@ impl Active {
         let pid = Pid::from_raw(getsockopt(&connection, sockopt::PeerCredentials)?.pid());
         let stat = StatFile::open(pid.as_raw());
         if let Err(error) = &stat {
-            // systemd hides it without ProtectProc=default, which `adaptive-bridge units` writes.
-            warn!(%pid, %error, "standby: cannot see whether the active process is stopped");
+            // systemd hides it without ProtectProc=default, which `units` writes.
+            warn!(
+                %pid,
+                %error,
+                "standby: cannot see whether the active process is stopped, and will not kill it then; as a \
+                 service: run `adaptive-bridge units --write`"
+            );
         }
         Ok(Self { connection, pid, stat: stat.ok() })
     }
@@ -102,7 +107,7 @@ pub(super) struct TakeOver {
     ended_at: MonotonicNs,
 }
 
-impl Standby {
+impl Waiting {
     /// Takes the place of the standby of the role `name`; `None` if `stop` was requested meanwhile.
     pub fn open(
         settings: &Settings,
@@ -170,7 +175,10 @@ impl Standby {
             }
             self.ended_at = clock::monotonic();
             let try_until = if was_connected { self.ended_at.plus_ms(END_MS) } else { self.ended_at };
-            let Some(lock) = self.take(settings, name, try_until)? else { continue };
+            let Some(lock) = self.take(settings, name, try_until)? else {
+                free_since = None;
+                continue;
+            };
             let since = *free_since.get_or_insert(self.ended_at);
             let has_sockets = !self.sockets.is_empty() || self.is_taken_back;
             if has_sockets || self.ended_at.since(since) > GIVE_WAY_MS * 1_000_000 {
