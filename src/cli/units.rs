@@ -9,8 +9,9 @@ use std::process::ExitCode;
 use clap::Args;
 
 use super::{ConfigArguments, EXIT_USAGE, failed, print};
-use crate::config::Lane;
-use crate::config::{self, MetricsListener, Scheduling, SchedulingPolicy, SecretSource, Settings, Standby};
+use crate::config::{
+    self, Lane, MetricsListener, Scheduling, SchedulingPolicy, SecretSource, Settings, Standby,
+};
 use crate::model::TrafficClass;
 use crate::process::MemoryNeeds;
 

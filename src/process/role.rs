@@ -1,5 +1,5 @@
-//! Start-up and shutdown that ingress, egress and control share: lock, reloads, scheduling, shared memory,
-//! health, DDS participant.
+//! What ingress, egress and control share while they serve their role: reloads, health, DDS participant,
+//! shutdown.
 
 use std::net::UdpSocket;
 

@@ -29,7 +29,7 @@ use crate::config::{Configuration, Settings, Standby};
 use crate::model::{MonotonicNs, TrafficClass};
 use crate::policy::{ChildExit, GiveUpReason, HangWatch, RestartBackoff, RestartDecision};
 use crate::shm::{RoleLock, ShmError, root_of};
-use crate::telemetry::{Snapshot, Threads};
+use crate::telemetry::{ProcessReading, Snapshot, Threads};
 
 /// Interval at which the supervisor checks for requests, and its children if no signal tells that one ended.
 const POLL_MS: u64 = 20;
@@ -45,6 +45,13 @@ const HANG_MS: u64 = 5_000;
 /// How long a child that has a standby is not restarted: its start would take CPU time from the take-over,
 /// which takes some 10 ms.
 const TAKE_OVER_MS: u64 = 200;
+
+const fn hang_ms(class: TrafficClass) -> u64 {
+    match class {
+        TrafficClass::Critical => HANG_CRITICAL_MS,
+        TrafficClass::Noncritical => HANG_MS,
+    }
+}
 
 /// How long a child may take to complete its first turn before it is killed and restarted. The service units
 /// have the same as `TimeoutStartSec`.
@@ -121,31 +128,24 @@ pub fn up(
     let _lock = RoleLock::acquire(&root, &settings.instance, "up")?;
     let folder = root.join(settings.instance.as_str());
     let mut children = Vec::new();
-    let mut add_kept = |role: &str, own: &[&str], standby| {
+    let mut add = |role: &str, own: &[&str], class: TrafficClass, standby: Standby| {
         let second = (standby == Standby::Warm).then(|| format!("{role}-2"));
         for name in [Some(role.to_owned()), second].into_iter().flatten() {
-            let child = Supervised::new(&name, own, arguments, &folder, HANG_CRITICAL_MS);
-            let backoff = match standby {
-                Standby::None => child.backoff,
-                Standby::Warm => RestartBackoff::with_standby(clock::monotonic()),
-            };
-            children.push(Supervised { role: role.to_owned(), backoff, ..child.keep_sockets() });
+            let mut child = Supervised::new(&name, own, arguments, &folder, hang_ms(class));
+            if class == TrafficClass::Critical {
+                child = child.keep_sockets();
+            }
+            if standby == Standby::Warm {
+                child.role = role.to_owned();
+                child.backoff = RestartBackoff::with_standby(clock::monotonic());
+            }
+            children.push(child);
         }
     };
-    add_kept("ingress", &["ingress"], settings.ingress_standby);
-    let (critical, others): (Vec<_>, Vec<_>) = settings
-        .lanes
-        .iter()
-        .filter(|lane| lane.is_used())
-        .partition(|lane| lane.class() == TrafficClass::Critical);
-    for lane in critical {
+    add("ingress", &["ingress"], TrafficClass::Critical, settings.ingress_standby);
+    for lane in settings.lanes.iter().filter(|lane| lane.is_used()) {
         let own = ["egress", "--lane", lane.name.as_str()];
-        add_kept(&format!("egress-{}", lane.name), &own, lane.standby);
-    }
-    for lane in others {
-        let own = ["egress", "--lane", lane.name.as_str()];
-        let name = format!("egress-{}", lane.name);
-        children.push(Supervised::new(&name, &own, arguments, &folder, HANG_MS));
+        add(&format!("egress-{}", lane.name), &own, lane.class(), lane.standby);
     }
     children.push(Supervised::new("control", &["control"], arguments, &folder, HANG_MS));
     children.iter_mut().for_each(|child| child.watchdog = watchdog);
@@ -260,15 +260,17 @@ impl<'a> ManagerReport<'a> {
         let mut turned = 0;
         for child in &mut *children {
             let reading = next.processes.iter().find(|reading| reading.name == child.role);
-            // A child that has not completed its first turn is still starting.
-            let health = reading.map(|reading| (reading.health.pid, reading.health.alive_at));
-            let health = health.filter(|_| reading.is_some_and(|reading| reading.health.turns > 0));
-            let standby = reading.map(|reading| (reading.standby.pid, reading.standby.alive_at));
-            let own = [health, standby].into_iter().flatten().find(|(pid, _)| Some(*pid) == child.pid());
-            turned += usize::from(own.is_some());
-            match own {
+            let alive_at = reading.and_then(|ProcessReading { health, standby, .. }| {
+                // An active child that has not completed its first turn is still starting.
+                if health.turns > 0 && Some(health.pid) == child.pid() {
+                    return Some(health.alive_at);
+                }
+                (Some(standby.pid) == child.pid()).then_some(standby.alive_at)
+            });
+            turned += usize::from(alive_at.is_some());
+            match alive_at {
                 _ if !self.watchdog => {}
-                Some((_, alive_at)) => child.check_progress(alive_at, now),
+                Some(alive_at) => child.check_progress(alive_at, now),
                 None => child.check_start(now),
             }
         }

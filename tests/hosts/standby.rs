@@ -5,12 +5,11 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
-use support::bed::{Bed, CRITICAL, INPUT, SCAN};
+use support::bed::{Bed, CRITICAL, INPUT, SCAN, STANDBYS};
 use support::peer::{Peer, Received, RunningPeer, Sent};
 use support::process::signal;
 use support::ros;
 
-const STANDBYS: &str = "lanes: {critical: {standby: warm}}\nprocesses: {ingress: {standby: warm}}\n";
 const RATE_HZ: f64 = 200.0;
 /// The subscriber whose samples are looked at one by one.
 const WATCHED: &str = "Cyclone DDS, RELIABLE";
@@ -46,6 +45,18 @@ fn pauses_ms(subscriber: &RunningPeer, first: usize) -> Vec<f64> {
     };
     let times: Vec<f64> = events.map(at_ms).collect();
     times.windows(2).map(|pair| pair[1] - pair[0]).collect()
+}
+
+/// Ends a subscriber, which must have stayed matched.
+fn end(name: &str, subscriber: RunningPeer, sent: &Sent) -> Received {
+    let matches = subscriber.matches();
+    let received: Received = subscriber.end();
+    println!(
+        "{name}: matched, unmatched {matches:?}; of {}: {} missing, {} twice, longest gap {:.0} ms",
+        sent.ok, received.missing_count, received.duplicates, received.max_gap_ms
+    );
+    assert_eq!(matches, (1, 0), "{name}");
+    received
 }
 
 #[test]
@@ -108,13 +119,7 @@ fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
     sent.assert_not_blocked();
     bed.wait_accounted();
     for (name, subscriber) in subscribers {
-        let matches = subscriber.matches();
-        let received: Received = subscriber.end();
-        println!(
-            "{name}: matched, unmatched {matches:?}; of {}: {} missing, {} twice, longest gap {:.0} ms",
-            sent.ok, received.missing_count, received.duplicates, received.max_gap_ms
-        );
-        assert_eq!(matches, (1, 0), "{name}");
+        let received = end(name, subscriber, &sent);
         received.assert_sound();
         // A BEST_EFFORT subscriber may miss the sample that was numbered and not sent at a kill.
         let most = if name.ends_with("BEST_EFFORT") { events.len() as u64 } else { 0 };
@@ -209,14 +214,7 @@ mod long {
             if name == WATCHED {
                 println!("{}", pauses(&subscriber));
             }
-            let matches = subscriber.matches();
-            let received: Received = subscriber.end();
-            println!(
-                "{name}: matched, unmatched {matches:?}; of {}: {} missing, {} twice, longest gap {:.0} ms",
-                sent.ok, received.missing_count, received.duplicates, received.max_gap_ms
-            );
-            assert_eq!(matches, (1, 0), "{name}");
-            received.assert_all_of(sent);
+            end(name, subscriber, sent).assert_all_of(sent);
         }
         bed.end();
     }

@@ -7,7 +7,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
-use support::bed::{CRITICAL, INPUT, NONCRITICAL, SCAN};
+use support::bed::{CRITICAL, INPUT, NONCRITICAL, SCAN, STANDBYS as WITH_STANDBYS};
 use support::machine::{Machine, install, machine_missing};
 use support::netns::{Host, Net};
 use support::peer::{Peer, Received, RunningPeer, Sent};
@@ -214,9 +214,7 @@ fn a_killed_or_stopped_unit_is_restarted_and_delays_no_other() {
 #[test]
 fn a_standby_takes_over_from_a_killed_or_stopped_unit() {
     let test = "a_standby_takes_over_from_a_killed_or_stopped_unit";
-    let yaml =
-        format!("{SCAN}lanes: {{critical: {{standby: warm}}}}\nprocesses: {{ingress: {{standby: warm}}}}\n");
-    let Some(bed) = Bed::boot(test, &yaml) else { return };
+    let Some(bed) = Bed::boot(test, &format!("{SCAN}{WITH_STANDBYS}")) else { return };
     bed.machine.run(&["adaptive-bridge", "units", "--write"]);
     bed.machine.run(&["systemctl", "daemon-reload"]);
     bed.start();

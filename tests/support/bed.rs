@@ -13,6 +13,8 @@ use super::process::Process;
 /// start.
 pub const SCAN: &str = "topics:\n  - {id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, \
                         max_sample_bytes: 65536}\n";
+/// The keys with which ingress and the critical lane have standbys.
+pub const STANDBYS: &str = "lanes: {critical: {standby: warm}}\nprocesses: {ingress: {standby: warm}}\n";
 /// The DDS type of the route.
 pub const SCAN_TYPE: &str = "sensor_msgs::msg::dds_::LaserScan_";
 /// The DDS topic of the route's input.

@@ -62,8 +62,8 @@ impl FormerReaders {
         now < self.hold_ends_at
     }
 
-    /// Whether a lane that catches up may still wait for acknowledgements: as long again, because what has
-    /// waited for a second is the most that can overflow its writer.
+    /// Whether a lane that catches up may still wait for acknowledgements: for a second after the hold, whose
+    /// samples would overflow the writer if they were sent at once.
     pub fn may_pace(&self, now: MonotonicNs) -> bool {
         now < self.hold_ends_at.plus_ms(HOLD_MS)
     }

@@ -53,7 +53,7 @@ impl WriterRecord {
             route: output.route,
             writing: Arc::default(),
             is_first,
-            may_continue: is_first && may_be_continued(role, output),
+            may_continue: may_be_continued(role, output),
         })
     }
 

@@ -58,7 +58,7 @@ fn processes(page: &mut Page, report: &Report) {
         Some(process.reading.health.starts as f64)
     });
     each("process_standby", Gauge, "1 while a standby waits for its role.", |process| {
-        Some(f64::from(u8::from(process.reading.standby.pid > 0)))
+        Some(f64::from(process.reading.standby.pid > 0))
     });
     each("process_take_overs_total", Counter, "How often a standby has taken its role over.", |process| {
         Some(process.reading.standby.take_overs as f64)

@@ -60,7 +60,7 @@ fn samples_that_waited_for_a_lane_wait_until_those_before_are_sent() {
     output.unsent.pop_sent(1);
     assert_eq!(take_all(&mut output), [1]);
     assert!(!output.is_paced());
-    // Not for longer than former readers are waited for, and not once it has caught up.
+    // Not for longer than a second after the hold, and not once it has caught up.
     output.unsent.push(unsent(most + 1));
     host.publish_next(2);
     output.may_be_behind = true;
