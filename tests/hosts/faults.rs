@@ -99,6 +99,42 @@ fn a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_costs_no_c
 }
 
 #[test]
+fn a_critical_egress_or_an_ingress_that_is_stopped_for_1_5_s_costs_no_sample() {
+    let test = "a_critical_egress_or_an_ingress_that_is_stopped_for_1_5_s_costs_no_sample";
+    let _alone = support::exclusive();
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let peers = [Peer::fast(), Peer::cyclone()];
+    let subscribers = peers.map(|peer| bed.subscribe("critical", peer.keep_last(1000), CRITICAL));
+    let publisher = bed.publish(Peer::cyclone().keep_last(1000).rate_hz(200.0), INPUT);
+    let flow_on = || {
+        for subscriber in &subscribers {
+            subscriber.wait_received(subscriber.received() + 200);
+        }
+    };
+    flow_on();
+    for role in ["egress-critical", "ingress", "egress-critical", "ingress"] {
+        let stopped = bed.pid(role);
+        signal(stopped, Signal::SIGSTOP);
+        // The watchdog restarts a process that is stopped for 2 s. 300 samples are published in this time:
+        // the queue of the lane has room for 64 and the history of its writer for 256.
+        std::thread::sleep(Duration::from_millis(1_500));
+        signal(stopped, Signal::SIGCONT);
+        flow_on();
+        assert_eq!(bed.pid(role), stopped, "{role} was restarted");
+    }
+    let sent: Sent = publisher.end();
+    assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+    for subscriber in subscribers {
+        subscriber.wait_received(sent.ok);
+        let received: Received = subscriber.end();
+        received.assert_sound();
+        assert_eq!((received.received, received.missing_count), (sent.ok, 0), "{received:?}");
+    }
+    bed.wait_accounted();
+    bed.end();
+}
+
+#[test]
 fn remote_subscribers_that_are_slow_stopped_or_disconnected_cost_no_critical_sample() {
     let test = "remote_subscribers_that_are_slow_stopped_or_disconnected_cost_no_critical_sample";
     // It asserts the rate of the flow.

@@ -167,9 +167,9 @@ pub(super) const ROWS: &[Row] = &[
     ),
     // Each sample occupies `max_sample_bytes`.
     restarts(&["lanes.<lane>.queue_depth"], Whole(1, 4_096, " samples"), "64 critical, 16 noncritical").doc(
-        "Samples of each route that may wait for the lane in shared memory. The critical lane needs at \
-         least the rate times the longest delay of its process: 64 is two seconds at 30 Hz, 13 ms at 5 \
-         kHz.",
+        "Samples of each route that may wait for the lane in shared memory: 64 are two seconds at 30 Hz, \
+         13 ms at 5 kHz. When they are more, the oldest leave the queue. A critical lane reads those from \
+         the last 512 that ingress keeps of a route (16 MiB at most), unless it has been behind for 2 s.",
     ),
     restarts(&["lanes.<lane>.max_borrowed"], Whole(1, 4_096, " samples"), "8").doc(
         "Samples of each route that the lane may hold in shared memory at once while DDS sends them. \

@@ -62,12 +62,6 @@ impl FormerReaders {
         now < self.hold_ends_at
     }
 
-    /// Whether a lane that catches up may still wait for acknowledgements: for a second after the hold, whose
-    /// samples would overflow the writer if they were sent at once.
-    pub fn may_pace(&self, now: MonotonicNs) -> bool {
-        now < self.hold_ends_at.plus_ms(HOLD_MS)
-    }
-
     /// Removes a reader that has matched.
     pub fn matched(&mut self, reader: Guid) {
         self.missing.retain(|missing| *missing != reader);
@@ -172,7 +166,6 @@ mod tests {
         let board = matched(&mut first(), [0, 1]);
         let mut process = FormerReaders::of(&board, at(500));
         assert!(process.hold(at(500 + HOLD_MS - 1)) && !process.hold(at(500 + HOLD_MS)));
-        assert!(process.may_pace(at(500 + 2 * HOLD_MS - 1)) && !process.may_pace(at(500 + 2 * HOLD_MS)));
         process.matched(guid(0));
         assert!(process.hold(at(500)));
         process.matched(guid(1));

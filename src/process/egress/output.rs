@@ -31,7 +31,7 @@ use crate::model::{
     DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MonotonicNs, OutputReaders, PartialSample,
     SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy,
 };
-use crate::policy::{SequenceOutcome, SequenceTracker, critical_drop};
+use crate::policy::{CatchUp, SequenceOutcome, SequenceTracker, critical_drop};
 use crate::shm::{
     BoardWriter, Boards, HistogramWriter, ProcessRole, QueueLimits, RouteChannel, SampleSubscriber,
     ShmSample, Stage, SubscriberRole, TakeError,
@@ -83,10 +83,11 @@ pub(super) struct Output {
     former: Option<Box<FormerSamples>>,
     /// Samples that were taken, or copied from the backlog, and are the next ones.
     next: VecDeque<ShmSample>,
-    /// Whether samples may wait that were published while no process served the lane: until one that is later
-    /// was taken and the queue was empty.
-    may_be_behind: bool,
-    /// Whether such samples wait until readers have acknowledged those before.
+    /// How the lane receives what was published while it did not run.
+    catch_up: CatchUp,
+    /// Samples taken since the queue was empty.
+    taken_in_a_row: u64,
+    /// Whether samples wait until those before are sent, and acknowledged while the lane catches up.
     is_paced: bool,
     /// Whether samples wait in the queue until the former readers have matched.
     is_held: bool,
@@ -167,7 +168,11 @@ impl Output {
             record,
             former: Some(Box::new(former_samples)),
             next: VecDeque::new(),
-            may_be_behind: lane.class() == TrafficClass::Critical,
+            catch_up: match lane.class() {
+                TrafficClass::Critical => CatchUp::of_critical(offer.window_samples, started_at),
+                TrafficClass::Noncritical => CatchUp::never(),
+            },
+            taken_in_a_row: 0,
             is_paced: false,
             last_publisher: Guid::default(),
             unmatched: Vec::new(),
@@ -202,10 +207,7 @@ impl Output {
     /// because the new writer needs them for late joiners. After a restart, a critical lane takes none before
     /// its former readers have matched.
     pub fn take(&mut self) -> Option<ShmSample> {
-        if self.collects_former()
-            || (self.is_held && self.is_still_held())
-            || (self.may_be_behind && self.is_to_be_paced())
-        {
+        if self.collects_former() || (self.is_held && self.is_still_held()) || self.is_to_be_paced() {
             return None;
         }
         loop {
@@ -214,7 +216,7 @@ impl Output {
                 Ok(Some(sample)) => sample,
                 // The borrow limit loses nothing: the samples stay in the channel.
                 Ok(None) => {
-                    self.may_be_behind &= !self.caught_up;
+                    self.end_catch_up();
                     return None;
                 }
                 Err(TakeError::BorrowLimit) => return None,
@@ -225,14 +227,18 @@ impl Output {
             };
             let sequence = sample.header().sequence;
             let expected = self.tracker.last() + 1;
-            if self.may_be_behind && expected > 1 && expected < sequence {
-                let behind = self.backlog(expected..sequence);
-                if !behind.is_empty() {
-                    self.next.push_front(sample);
-                    behind.into_iter().rev().for_each(|sample| self.next.push_front(sample));
-                    continue;
+            if expected > 1 && expected < sequence {
+                self.begin_catch_up();
+                if self.catch_up.is_on(clock::monotonic) {
+                    let behind = self.backlog(expected..sequence);
+                    if !behind.is_empty() {
+                        self.next.push_front(sample);
+                        behind.into_iter().rev().for_each(|sample| self.next.push_front(sample));
+                        continue;
+                    }
                 }
             }
+            self.follow_burst();
             match self.tracker.record(sequence) {
                 SequenceOutcome::InOrder => {}
                 SequenceOutcome::AfterGap(missing) => self.count_missing(missing, sample.header()),
@@ -267,6 +273,10 @@ impl Output {
     /// Begins to send a large sample of which a part has arrived, sends more of it, or withdraws it. To be
     /// called when all samples are taken that were published before the board was read.
     pub fn follow_progress(&mut self) {
+        // Samples before that one still wait.
+        if self.is_held || self.is_paced {
+            return;
+        }
         let Some(partial) = self.partial.take() else { return };
         let Some(writer) = &self.writer else { return };
         // A new writer for late joiners, or of a place's next topic, may be due before the next sample.

@@ -3,6 +3,7 @@
 //! The types of the data plane allocate only on construction and when their configuration changes.
 
 mod absences;
+mod catch_up;
 mod classifier;
 mod clock_offset;
 mod cut_through;
@@ -27,6 +28,7 @@ mod warnings;
 pub use absences::{
     Absence, AbsenceEvent, AbsenceWatch, HostInterface, MAX_WATCHED_PEERS, REMEMBER_ABSENCE_MS,
 };
+pub use catch_up::CatchUp;
 pub use classifier::{
     FORGET_UNLISTED_MS, MIN_SETTLED, SubscriberClassifier, Transition, TransitionReason, is_forgotten,
 };

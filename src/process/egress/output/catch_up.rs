@@ -1,4 +1,4 @@
-//! How a restarted critical lane catches up with what was published while it was down.
+//! How a critical lane catches up with what was published while it was down, or while it did not run.
 //!
 //! A VOLATILE reader never gets what was written before it matched, so the samples wait in the queue until
 //! the readers of the former process have matched again. An output with a history needs no wait: it gives
@@ -40,18 +40,48 @@ impl Output {
         self.is_held
     }
 
-    /// Whether samples that waited for this process wait until the library has sent the ones before, and the
-    /// readers have acknowledged them: all of them at once would overflow the sockets of the readers, and
-    /// leave the history of the writer before they are repaired.
+    /// Whether samples wait until the library has sent the ones before: it would discard the oldest. A lane
+    /// that catches up also waits until the readers have acknowledged them: all of them at once would
+    /// overflow the sockets of the readers, and leave the history of the writer before they are repaired.
     pub(super) fn is_to_be_paced(&mut self) -> bool {
-        // The writer retains twice as many.
-        let most = self.offer.window_samples.div_ceil(2);
-        let is_behind = |reader: ReaderRecord| reader.reliable == 1 && reader.unacknowledged >= most as u64;
-        let has_slow_reader = |writer: &RawWriter| writer.matched_readers().any(is_behind);
-        self.is_paced = self.history.is_none()
-            && self.former_readers.may_pace(clock::monotonic())
-            && (self.unsent.len() >= most || self.writer.as_ref().is_some_and(has_slow_reader));
+        self.is_paced =
+            self.unsent.len() as u64 >= self.catch_up.most_unacknowledged() || self.waits_for_readers();
         self.is_paced
+    }
+
+    fn waits_for_readers(&self) -> bool {
+        self.catch_up.is_on(clock::monotonic)
+            && self.history.is_none()
+            && self.writer.as_ref().is_some_and(|writer| {
+                writer.matched_readers().any(|reader| self.catch_up.waits_for(&reader))
+            })
+            // The others must not lose samples to a slow one.
+            && !self.are_samples_nearly_lost()
+    }
+
+    /// The lane has not taken samples in time.
+    pub(super) fn begin_catch_up(&mut self) {
+        if self.catch_up.is_level() {
+            let readers = self.writer.iter().flat_map(RawWriter::matched_readers);
+            self.catch_up.begin(readers, clock::monotonic());
+        }
+    }
+
+    /// The lane takes one more sample before its queue is empty.
+    pub(super) fn follow_burst(&mut self) {
+        self.taken_in_a_row += 1;
+        if self.taken_in_a_row == self.catch_up.burst_samples() {
+            self.begin_catch_up();
+        }
+    }
+
+    /// The queue is empty.
+    pub(super) fn end_catch_up(&mut self) {
+        self.taken_in_a_row = 0;
+        // After a restart it is empty before ingress delivers to it.
+        if self.caught_up {
+            self.catch_up.end();
+        }
     }
 
     /// Whether samples wait for former readers.

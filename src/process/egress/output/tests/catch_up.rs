@@ -14,7 +14,7 @@ fn take_all(output: &mut Output) -> Vec<u64> {
 }
 
 #[test]
-fn a_restarted_critical_lane_takes_from_the_backlog_what_its_queue_has_lost() {
+fn a_critical_lane_takes_from_the_backlog_what_its_queue_has_lost() {
     for (domain, lane) in [(156, CRITICAL), (157, NONCRITICAL)] {
         let mut host = Host::start(domain, lane, SCAN);
         let channel = RouteChannel::of(&host.settings, 0);
@@ -38,36 +38,53 @@ fn a_restarted_critical_lane_takes_from_the_backlog_what_its_queue_has_lost() {
             assert_eq!(take_all(&mut output).len(), output.subscriber.queue_depth());
             continue;
         }
-        assert_eq!(take_all(&mut output), (11..=130).collect::<Vec<_>>());
+        assert_eq!(take_all(&mut output), (11..=130).collect::<Vec<_>>(), "after a restart");
+        publish(&host, 131..=300);
+        assert_eq!(take_all(&mut output), (131..=300).collect::<Vec<_>>(), "after a stall");
         assert_eq!(output.counters.get().drops.total(), 0);
-        // It has caught up.
-        publish(&host, 131..=200);
-        assert_eq!(take_all(&mut output), (137..=200).collect::<Vec<_>>());
-        assert_eq!(output.counters.get().drops.total(), 6);
+        // A lane that stays behind goes on with its queue.
+        output.catch_up = CatchUp::of_critical(256, MonotonicNs(0));
+        publish(&host, 301..=400);
+        assert_eq!(take_all(&mut output), (337..=400).collect::<Vec<_>>());
+        assert_eq!(output.counters.get().drops.total(), 36);
     }
 }
 
 #[test]
-fn samples_that_waited_for_a_lane_wait_until_those_before_are_sent() {
+fn samples_wait_until_the_library_has_sent_those_before() {
     let mut host = Host::start(158, CRITICAL, SCAN);
     let mut output = host.open();
+    output.catch_up.end();
     host.publish_next(1);
-    let most = output.offer.window_samples as i64 / 2;
-    for number in 1..=most {
+    for number in 1..=output.offer.window_samples as i64 / 2 {
         output.unsent.push(unsent(number));
     }
     assert!(output.take().is_none() && output.is_paced());
     output.unsent.pop_sent(1);
     assert_eq!(take_all(&mut output), [1]);
     assert!(!output.is_paced());
-    // Not for longer than a second after the hold, and not once it has caught up.
-    output.unsent.push(unsent(most + 1));
-    host.publish_next(2);
-    output.may_be_behind = true;
-    output.former_readers = FormerReaders::of(&OutputReaders::default(), MonotonicNs(0));
-    assert_eq!(take_all(&mut output), [2]);
-    output.former_readers = FormerReaders::of(&OutputReaders::default(), clock::monotonic());
-    host.publish_next(3);
-    assert!(!output.may_be_behind);
-    assert_eq!(take_all(&mut output), [3]);
+}
+
+#[test]
+fn a_lane_that_takes_many_samples_in_a_row_catches_up() {
+    let mut host = Host::start(166, CRITICAL, SCAN);
+    let mut output = host.open();
+    let mut taken = 0;
+    let mut take = |output: &mut Output, count: u64| {
+        (taken + 1..=taken + count).for_each(|sequence| host.publish_next(sequence));
+        taken += count;
+        for _ in 0..count {
+            output.take().unwrap();
+        }
+        output.catch_up.is_on(clock::monotonic)
+    };
+    assert!(take(&mut output, 1), "a lane that starts");
+    assert!(output.take().is_none());
+    let burst = output.catch_up.burst_samples();
+    assert!(!take(&mut output, burst - 1));
+    assert!(output.take().is_none());
+    assert!(!take(&mut output, 1), "the queue was empty before");
+    assert!(take(&mut output, burst - 1));
+    assert!(output.take().is_none());
+    assert!(!output.catch_up.is_on(clock::monotonic));
 }
