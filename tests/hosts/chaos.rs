@@ -1,6 +1,7 @@
 //! Chaos: processes of the bridge are killed and stopped at random, its configuration file is edited and
 //! reloaded, a second publisher comes and goes, and malformed datagrams arrive all along. At the end every
-//! sample of the publisher is forwarded, or dropped with a named reason, and all sums agree.
+//! sample of the publisher is forwarded, or dropped with a named reason, and all sums agree. With standbys
+//! and without.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -9,7 +10,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
-use support::bed::{Bed, CRITICAL, INPUT, SCAN, outputs};
+use support::bed::{Bed, CRITICAL, INPUT, SCAN, STANDBYS, outputs};
 use support::netns::udp_ports;
 use support::peer::{Peer, Received, RunningPeer, Sent};
 
@@ -20,6 +21,8 @@ const SECONDS: u64 = 40;
 const SECONDS_VARIABLE: &str = "ADAPTIVE_BRIDGE_TEST_CHAOS_S";
 const RATE_HZ: f64 = 200.0;
 const ROLES: [&str; 4] = ["ingress", "egress-critical", "egress-noncritical", "control"];
+/// The second processes of the roles that have a standby.
+const SECOND: [&str; 2] = ["ingress-2", "egress-critical-2"];
 
 /// Sends a signal to a process that may have ended already.
 fn try_signal(pid: i32, signal: Signal) {
@@ -36,6 +39,7 @@ fn sum(counters: &Value) -> u64 {
 
 struct Chaos<'b> {
     bed: &'b Bed,
+    with_standbys: bool,
     random: Random,
     /// The publisher that comes and goes.
     visitor: Option<RunningPeer>,
@@ -48,7 +52,9 @@ impl Chaos<'_> {
         const EVENTS: [&str; 4] = ["kill", "stop", "reload", "publisher"];
         let event = EVENTS[self.random.below(EVENTS.len())];
         *self.events.entry(event).or_default() += 1;
-        let process = self.bed.pid(ROLES[self.random.below(ROLES.len())]);
+        let second = if self.with_standbys { &SECOND[..] } else { &[] };
+        let children = [&ROLES[..], second].concat();
+        let process = self.bed.pid(children[self.random.below(children.len())]);
         match event {
             "kill" => try_signal(process, Signal::SIGKILL),
             "stop" => {
@@ -70,14 +76,20 @@ impl Chaos<'_> {
     fn edit_and_reload(&mut self) {
         let rate_hz = 1 + self.random.below(30);
         let edited = [
-            format!("{SCAN}lanes: {{noncritical: {{max_rate_hz: {rate_hz}}}}}\n"),
+            format!("noncritical: {{max_rate_hz: {rate_hz}}}"),
             // One more lane, which waits for a restart.
-            format!("{SCAN}lanes: {{critical: {{}}, noncritical: {{}}, rviz: {{class: noncritical}}}}\n"),
-            format!("{SCAN}lanes: {{noncritical: {{max_rate_hz: fast}}}}\n"),
-            "topics: [".to_owned(),
+            "noncritical: {}, rviz: {class: noncritical}".to_owned(),
+            "noncritical: {max_rate_hz: fast}".to_owned(),
+            "noncritical: [".to_owned(),
         ];
         let edited = &edited[self.random.below(edited.len())];
-        self.write_and_reload(edited);
+        self.write_and_reload(&self.yaml(edited));
+    }
+
+    /// The configuration with these lanes beside the critical one.
+    fn yaml(&self, lanes: &str) -> String {
+        let standby = if self.with_standbys { "{standby: warm}" } else { "{}" };
+        format!("{SCAN}processes: {{ingress: {standby}}}\nlanes: {{critical: {standby}, {lanes}}}\n")
     }
 
     fn write_and_reload(&self, yaml: &str) {
@@ -109,7 +121,7 @@ impl Chaos<'_> {
         if self.visitor.is_some() {
             self.toggle_publisher();
         }
-        self.write_and_reload(SCAN);
+        self.write_and_reload(&self.yaml("noncritical: {}"));
         self.bed.bridge.wait_status("all processes running", |status| {
             let processes = status["processes"].as_array().unwrap();
             let is_running =
@@ -126,9 +138,18 @@ mod long {
 
     #[test]
     fn in_chaos_every_sample_is_forwarded_or_dropped_with_a_named_reason() {
-        let test = "in_chaos_every_sample_is_forwarded_or_dropped_with_a_named_reason";
+        chaos("in_chaos_every_sample_is_forwarded_or_dropped_with_a_named_reason", false);
+    }
+
+    #[test]
+    fn in_chaos_with_standbys_every_sample_is_forwarded_or_dropped_with_a_named_reason() {
+        chaos("in_chaos_with_standbys_every_sample_is_forwarded_or_dropped_with_a_named_reason", true);
+    }
+
+    fn chaos(test: &str, with_standbys: bool) {
         let _alone = support::exclusive();
-        let Some(bed) = Bed::start(test, SCAN) else { return };
+        let standbys = if with_standbys { STANDBYS } else { "" };
+        let Some(bed) = Bed::start(test, &format!("{SCAN}{standbys}")) else { return };
         let subscriber = bed.subscribe("critical", Peer::cyclone().keep_last(4_000), CRITICAL);
         let publisher = bed.publish(Peer::cyclone().keep_last(1_000).rate_hz(RATE_HZ), INPUT);
         subscriber.wait_received(200);
@@ -145,7 +166,8 @@ mod long {
                 attacker.within(|| hostile::send(address, &ports, seed, &[], go_on))
             });
             let random = Random(seed);
-            let mut chaos = Chaos { bed: &bed, random, visitor: None, visitors: 0, events: BTreeMap::new() };
+            let (visitor, events) = (None, BTreeMap::new());
+            let mut chaos = Chaos { bed: &bed, with_standbys, random, visitor, visitors: 0, events };
             let until = Instant::now() + Duration::from_secs(seconds);
             while Instant::now() < until {
                 chaos.event();
@@ -185,7 +207,8 @@ mod long {
         // What a restarted lane writes before it has matched its subscribers counts as `no_reader`; this one
         // may have received it.
         // And one for each kill may have been written and not yet counted: it counts as `lane_down`.
-        let kills = bed.pids("egress-critical").len() as u64 - 1;
+        let processes = [bed.pids("egress-critical"), bed.pids("egress-critical-2")].concat();
+        let kills = processes.len() as u64 - 1;
         let uncounted = kills.min(number(&critical["drops"]["lane_down"]));
         let possible = forwarded..=forwarded + number(&critical["drops"]["no_reader"]) + uncounted;
         assert!(possible.contains(&received.received), "{received:?} of {critical}");
