@@ -252,8 +252,9 @@ impl Output {
             if sample.header().published_at >= self.started_at {
                 self.caught_up = true;
             }
-            if !self.caught_up && self.is_too_old(sample.header()) {
-                self.drop_sample(&sample, DropReason::LaneDown);
+            if self.is_too_old(sample.header()) {
+                let reason = if self.caught_up { self.gap_reason } else { DropReason::LaneDown };
+                self.drop_sample(&sample, reason);
                 continue;
             }
             self.follow_publisher(sample.header().writer_guid);

@@ -79,6 +79,14 @@ impl CatchUp {
         self.state == State::Level
     }
 
+    /// Since when the lane has been behind.
+    pub const fn since(&self) -> Option<MonotonicNs> {
+        match self.state {
+            State::Behind(since) => Some(since),
+            State::Level | State::Never => None,
+        }
+    }
+
     /// Whether the lane is behind, and has been for a short time only. `now` is read only if it is behind.
     pub fn is_on(&self, now: impl FnOnce() -> MonotonicNs) -> bool {
         matches!(self.state, State::Behind(since) if now() < since.plus_ms(MAX_CATCH_UP_MS))
@@ -114,7 +122,9 @@ mod tests {
         // It has not taken all samples that wait.
         lane.begin([], at(9_000));
         assert!(!lane.is_on(|| at(9_000)) && !lane.is_level());
+        assert_eq!(lane.since(), Some(at(500)));
         lane.end();
+        assert_eq!(lane.since(), None);
         assert!(!lane.is_on(|| unreachable!("the clock is not read")) && lane.is_level());
         lane.begin([], at(9_000));
         assert!(lane.is_on(|| at(10_999)) && !lane.is_on(|| at(11_000)));
@@ -149,7 +159,12 @@ mod tests {
     fn a_lane_of_the_freshest_samples_never_catches_up() {
         let mut lane = CatchUp::never();
         lane.begin([], at(0));
-        assert!(!lane.is_on(|| at(0)) && !lane.is_level() && !lane.waits_for(&reader(1, 500)));
+        assert!(
+            !lane.is_on(|| at(0))
+                && lane.since().is_none()
+                && !lane.is_level()
+                && !lane.waits_for(&reader(1, 500))
+        );
         lane.end();
         assert!(!lane.is_level());
     }

@@ -7,7 +7,7 @@
 use super::Output;
 use crate::clock;
 use crate::dds::RawWriter;
-use crate::model::{ReaderRecord, SampleHeader, TrafficClass};
+use crate::model::{ReaderRecord, SampleHeader};
 use crate::policy::is_stale;
 
 /// Older samples are left out, except for the last [`ANY_AGE_SAMPLES`]. At 1 Hz ingress retains those of some
@@ -112,18 +112,18 @@ impl Output {
         waiting >= self.subscriber.queue_depth() as u64 / 8 * 7 && !is_kept()
     }
 
-    /// Whether a sample from before the start of this process is too old to be forwarded: its LIFESPAN has
-    /// ended, or it belongs to a long outage.
+    /// Whether a sample is too old to be forwarded by a lane that is behind: its LIFESPAN has ended, or it
+    /// belongs to a long outage.
     pub(super) fn is_too_old(&self, header: &SampleHeader) -> bool {
         // A noncritical lane has a limit of its own, and late joiners may need any sample of a history.
-        if self.class != TrafficClass::Critical || self.history.is_some() {
+        let Some(behind_since) = self.catch_up.since().filter(|_| self.history.is_none()) else {
             return false;
-        }
+        };
         let age_ns = clock::monotonic().since(header.age_from());
         let lifespan_ms = self.offer.qos.lifespan_ms.unwrap_or(0);
         let last = self.boards.ingress(self.route).map_or(0, |ingress| ingress.published);
         is_stale(age_ns, lifespan_ms)
             || (last.saturating_sub(header.sequence) >= ANY_AGE_SAMPLES
-                && is_stale(self.started_at.since(header.published_at), CATCH_UP_MS))
+                && is_stale(behind_since.since(header.published_at), CATCH_UP_MS))
     }
 }

@@ -566,7 +566,7 @@ fn samples_of_a_critical_lane_wait_for_the_former_readers() {
 fn a_critical_lane_leaves_out_what_is_too_old_to_catch_up_with() {
     let mut host = Host::start(147, CRITICAL, SCAN);
     let mut output = host.open();
-    output.started_at = MonotonicNs(0).plus_ms(100_000);
+    output.catch_up = CatchUp::of_critical(256, MonotonicNs(0).plus_ms(100_000));
     host.role.boards.ingress_writer(0).update(|ingress| ingress.published = 20);
     let published = |ms| MonotonicNs(0).plus_ms(ms);
     // When the sample was published, its number, the LIFESPAN, and whether it is too old. Each was taken at
@@ -588,4 +588,7 @@ fn a_critical_lane_leaves_out_what_is_too_old_to_catch_up_with() {
     assert!(output.is_too_old(&oldest));
     output.history = Some(History::new(None));
     assert!(!output.is_too_old(&oldest), "late joiners may need it");
+    output.history = None;
+    output.catch_up.end();
+    assert!(!output.is_too_old(&oldest), "the lane is not behind");
 }
