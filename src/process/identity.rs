@@ -13,12 +13,16 @@ use tracing::{info, warn};
 use super::error::RoleError;
 use super::kept_sockets;
 use super::role::Role;
-use super::standby::Successor;
+use super::standby::{Leave, Successor};
 use crate::clock;
 use crate::config::Standby;
 use crate::dds::{DdsError, Kept, Participant, ParticipantIdentity, ParticipantOptions, host_addresses};
 use crate::model::{Guid, MonotonicNs, ProcessHealth, ProcessIdentity};
 use crate::shm::{BoardWriter, Journal, ProcessRole};
+
+/// Processes of one version continue each other, also if they are of different releases: an upgrade changes
+/// nothing for subscribers. To be raised with what a participant announces and with the journal's content.
+const VERSION: u32 = 1;
 
 /// The longest time without a process, below the lease of 15 s: then others drop the participant.
 const MAX_AWAY_MS: u64 = 10_000;
@@ -204,6 +208,15 @@ impl Identity {
         self.journal_at = now.plus_ns(clock::monotonic().since(now) * JOURNAL_SHARE);
     }
 
+    /// How the process ends now that it was asked to.
+    pub fn leave(&mut self, now: MonotonicNs) -> Leave {
+        match self.successor.as_mut().filter(|_| self.is_kept).map(|successor| successor.leave(now)) {
+            // The next process may not continue one that is not proven.
+            Some(Leave::HandOver) if now < self.proven_at => Leave::Soon,
+            leave => leave.unwrap_or(Leave::ForGood),
+        }
+    }
+
     /// The next process does not continue this one, which says goodbye.
     pub fn end(&mut self) {
         if self.board.get().is_intact() {
@@ -244,7 +257,7 @@ fn conditions(options: &ParticipantOptions) -> Result<u64, RoleError> {
     let mut hasher = DefaultHasher::new();
     (network.domain_id, format!("{:?}", network.interfaces), addresses).hash(&mut hasher);
     (&options.namespace, &options.node_name, options.graph_gid_bytes).hash(&mut hasher);
-    env!("CARGO_PKG_VERSION").hash(&mut hasher);
+    VERSION.hash(&mut hasher);
     Ok(hasher.finish())
 }
 

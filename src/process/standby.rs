@@ -48,6 +48,10 @@ pub(super) const NO_WATCHDOG_VARIABLE: &str = "ADAPTIVE_BRIDGE_NO_WATCHDOG";
 const END_MS: u64 = 100;
 const END_POLL: Duration = Duration::from_micros(100);
 
+/// How long a process that was asked to end serves on, to see whether its standby ends as well: that checks
+/// for a request each [`STOPPED_POLL_MS`].
+const LEAVE_MS: u64 = 100;
+
 /// How long a standby that has no sockets of the active process leaves the role to another process, which may
 /// have them from its supervisor.
 const GIVE_WAY_MS: u64 = 500;
@@ -301,17 +305,42 @@ fn open_socket() -> nix::Result<OwnedFd> {
     socket(AddressFamily::Unix, SockType::SeqPacket, flags, None)
 }
 
+/// How a process ends that was asked to.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Leave {
+    /// Not yet: its standby may have been asked to end, too.
+    Soon,
+    /// Without goodbye: its standby goes on as the same participant.
+    HandOver,
+    /// With goodbye, as there is no standby.
+    ForGood,
+}
+
 /// Sends the sockets of this process to its standby, as soon as there is one.
 pub(super) struct Successor {
     path: PathBuf,
     sockets: Vec<UdpSocket>,
     connection: Option<OwnedFd>,
+    /// From when on the process may hand over; `None` if it was not asked to end.
+    leave_at: Option<MonotonicNs>,
 }
 
 impl Successor {
     /// `path` is the socket of the standby.
     pub fn new(path: PathBuf, sockets: Vec<UdpSocket>) -> Self {
-        Self { path, sockets, connection: None }
+        Self { path, sockets, connection: None, leave_at: None }
+    }
+
+    /// How the process ends now that it was asked to.
+    pub fn leave(&mut self, now: MonotonicNs) -> Leave {
+        // It may have started since the last housekeeping.
+        self.housekeeping();
+        let serves_soon = |standby: &OwnedFd| !has_ended(standby) && !is_stopped(standby);
+        if self.sockets.is_empty() || !self.connection.as_ref().is_some_and(serves_soon) {
+            return Leave::ForGood;
+        }
+        let leave_at = *self.leave_at.get_or_insert(now.plus_ms(LEAVE_MS));
+        if now < leave_at { Leave::Soon } else { Leave::HandOver }
     }
 
     /// Connects to a standby that has none of the sockets. Never waits; some 5 µs without a standby.
@@ -345,8 +374,55 @@ impl Successor {
     }
 }
 
+/// Whether SIGSTOP has stopped the process that listens at the other end of a connection, as far as this one
+/// can see.
+fn is_stopped(connection: &OwnedFd) -> bool {
+    getsockopt(connection, sockopt::PeerCredentials)
+        .is_ok_and(|standby| StatFile::open(standby.pid()).is_ok_and(|stat| stat.is_stopped()))
+}
+
 /// Whether the other end of a connection, which sends nothing, is closed.
 fn has_ended(connection: &OwnedFd) -> bool {
     let mut polled = [PollFd::new(connection.as_fd(), PollFlags::POLLIN)];
     poll(&mut polled, PollTimeout::ZERO).is_ok_and(|ready| ready > 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(ms: u64) -> MonotonicNs {
+        MonotonicNs(0).plus_ms(ms)
+    }
+
+    #[test]
+    fn a_process_hands_over_to_a_standby_that_does_not_end_as_well() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("standby");
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let mut active = Successor::new(path.clone(), vec![socket]);
+        active.housekeeping();
+        assert_eq!(active.leave(at(0)), Leave::ForGood, "no standby");
+
+        let standby = listen_at(&path).unwrap();
+        assert_eq!(active.leave(at(1_000)), Leave::Soon);
+        let (connection, _) = standby.accept().unwrap();
+        assert_eq!(active.leave(at(1_000 + LEAVE_MS - 1)), Leave::Soon);
+        assert_eq!(active.leave(at(1_000 + LEAVE_MS)), Leave::HandOver);
+        drop((connection, standby));
+        assert_eq!(active.leave(at(1_000 + LEAVE_MS)), Leave::ForGood, "the standby has ended");
+    }
+
+    #[test]
+    fn a_process_that_gives_up_its_identity_does_not_hand_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("standby");
+        let standby = listen_at(&path).unwrap();
+        let mut active = Successor::new(path, vec![UdpSocket::bind("127.0.0.1:0").unwrap()]);
+        active.housekeeping();
+        let _connection = standby.accept().unwrap();
+        assert_eq!(active.leave(at(0)), Leave::Soon);
+        active.end();
+        assert_eq!(active.leave(at(LEAVE_MS)), Leave::ForGood);
+    }
 }

@@ -1,5 +1,5 @@
-//! The standbys of ingress and of the critical lane take over when the process that serves the role is killed
-//! or stopped. Uses real processes, signals and DDS peers on separate hosts.
+//! The standbys of ingress and of the critical lane take over when the process that serves the role is
+//! killed, stopped or asked to end. Uses real processes, signals and DDS peers on separate hosts.
 
 use std::time::Duration;
 
@@ -90,8 +90,8 @@ fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
         ("ingress", Signal::SIGKILL),
         (lane, Signal::SIGSTOP),
         ("ingress", Signal::SIGSTOP),
-        (lane, Signal::SIGKILL),
-        ("ingress", Signal::SIGKILL),
+        (lane, Signal::SIGTERM),
+        ("ingress", Signal::SIGTERM),
     ];
     for (index, (name, sent)) in events.into_iter().enumerate() {
         let active = wait_standby(&bed, name);
@@ -126,6 +126,28 @@ fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
         assert!(received.missing_count <= most, "{name}: {received:?}");
     }
     bed.end();
+}
+
+#[test]
+fn a_bridge_with_standbys_that_ends_says_goodbye() {
+    let test = "a_bridge_with_standbys_that_ends_says_goodbye";
+    let Some(mut bed) = Bed::start(test, &format!("{SCAN}{STANDBYS}")) else { return };
+    let subscriber = bed.subscribe("critical", Peer::cyclone(), CRITICAL);
+    let publisher = bed.publish(Peer::cyclone().rate_hz(RATE_HZ), INPUT);
+    subscriber.wait_received(20);
+    for name in ["ingress", "egress-critical"] {
+        wait_standby(&bed, name);
+    }
+    let status = bed.up.terminate();
+    let log = bed.up.log();
+    assert!(status.success(), "up ended with {status}\n{log}");
+    for (role, done) in [("ingress", "ingress is done"), ("egress-critical", "egress is done")] {
+        let of_role = |line: &&str| line.starts_with(&format!("[{role}"));
+        assert!(log.lines().filter(of_role).any(|line| line.contains(done)), "{log}");
+    }
+    assert!(!log.contains("hands over"), "{log}");
+    subscriber.wait_matched(0);
+    publisher.wait_matched(0);
 }
 
 /// Tests of a minute or more: `make test-long`.

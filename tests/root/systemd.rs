@@ -212,8 +212,8 @@ fn a_killed_or_stopped_unit_is_restarted_and_delays_no_other() {
 
 /// Either unit of a role may have it: the one that finds it taken waits.
 #[test]
-fn a_standby_takes_over_from_a_killed_or_stopped_unit() {
-    let test = "a_standby_takes_over_from_a_killed_or_stopped_unit";
+fn a_standby_takes_over_from_a_killed_stopped_or_restarted_unit() {
+    let test = "a_standby_takes_over_from_a_killed_stopped_or_restarted_unit";
     let Some(bed) = Bed::boot(test, &format!("{SCAN}{WITH_STANDBYS}")) else { return };
     bed.machine.run(&["adaptive-bridge", "units", "--write"]);
     bed.machine.run(&["systemctl", "daemon-reload"]);
@@ -227,16 +227,23 @@ fn a_standby_takes_over_from_a_killed_or_stopped_unit() {
     };
     let flow = bed.flow();
     let mut take_overs = 0;
-    for signal in ["KILL", "STOP", "KILL"] {
+    for signal in ["KILL", "STOP", "TERM", "KILL"] {
         take_overs += 1;
-        for name in ["egress-critical", "ingress"] {
+        for (name, units) in
+            [("egress-critical", [EGRESS_CRITICAL, STANDBYS[1]]), ("ingress", [INGRESS, STANDBYS[0]])]
+        {
             let active = support::wait_for(format!("a standby of {name}"), || {
                 let process = process(name).filter(|process| process["standby"]["pid"] != 0)?;
                 Some(process["pid"].to_string())
             });
             // See the test above. A standby has the sockets of the active process after 0.1 s.
             std::thread::sleep(Duration::from_millis(1_500));
-            bed.machine.run(&["kill", "-s", signal, &active]);
+            if signal == "TERM" {
+                let unit = units.into_iter().find(|unit| bed.machine.main_pid(unit) == active);
+                bed.machine.run(&["systemctl", "restart", unit.expect("a unit of the active process")]);
+            } else {
+                bed.machine.run(&["kill", "-s", signal, &active]);
+            }
             let took = support::wait_for(format!("take-over {take_overs} of {name}"), || {
                 let standby = &process(name)?["standby"];
                 (standby["take_overs"] == take_overs).then(|| standby["took_ns"].clone())
@@ -699,6 +706,29 @@ fn the_package_installs_upgrades_while_samples_flow_and_leaves_nothing() {
     }
     flow.wait_on();
     flow.end();
+
+    // With standbys no subscriber notices an upgrade; the way back to the former package is one, too.
+    bed.machine.write(CONFIG, &format!("{SCAN}{WITH_STANDBYS}"));
+    bed.machine.run(&["adaptive-bridge", "units", "--write"]);
+    bed.machine.run(&["systemctl", "daemon-reload"]);
+    bed.machine.run(&["systemctl", "restart", TARGET]);
+    let flow = bed.flow();
+    let units = [&UNITS[..], &STANDBYS].concat();
+    for unit in &units {
+        bed.machine.wait_property(unit, "ActiveState", "active");
+    }
+    let pids: Vec<_> = units.iter().map(|unit| bed.machine.main_pid(unit)).collect();
+    // A process leaves its identity once it has run for a second.
+    flow.wait_critical(300);
+    bed.machine.run(&["dpkg", "-i", "/old.deb"]);
+    for (unit, pid) in units.iter().zip(&pids) {
+        bed.machine.wait_property(unit, "ActiveState", "active");
+        assert_ne!(bed.machine.main_pid(unit), *pid, "{unit} was not restarted");
+    }
+    flow.wait_on();
+    assert_eq!(flow.critical.matches(), (1, 0));
+    let (sent, received) = flow.end();
+    assert_eq!((received.missing_count, received.received), (0, sent.ok), "{received:?}");
 
     bed.machine.run(&["dpkg", "-r", "adaptive-bridge"]);
     let processes = bed.machine.try_run(&["pgrep", "-u", "adaptive-bridge"]);

@@ -33,6 +33,7 @@ use super::notify::{Meter, Notifier, write_drops, write_list};
 use super::place::Place;
 use super::reload::ReloadRequests;
 use super::role::{Role, lane_index, participant_options};
+use super::standby::Leave;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{self, Configuration, Forwarding, Lane, Settings};
@@ -104,11 +105,23 @@ pub fn egress(
         domain_id = lane.network.domain_id,
         "egress is up"
     );
-    while !stop.is_requested() {
+    let leave = loop {
+        if stop.is_requested() {
+            match egress.leave() {
+                Leave::Soon => {}
+                leave => break leave,
+            }
+        }
         let turn = egress.turn();
         egress.sleep(&turn);
-    }
+    };
     egress.role.notifier.stopping();
+    if leave == Leave::HandOver {
+        info!(lane = name, "egress hands over to its standby");
+        // As if it were killed: what is dropped would say goodbye, and give up the writers.
+        std::mem::forget(egress);
+        return Ok(());
+    }
     egress.shut_down();
     info!(lane = name, "egress is done");
     Ok(())
@@ -371,6 +384,11 @@ impl Egress {
         for output in &mut self.outputs {
             output.set_forwarding(forwarding);
         }
+    }
+
+    fn leave(&mut self) -> Leave {
+        let now = clock::monotonic();
+        self.identity.as_mut().map_or(Leave::ForGood, |identity| identity.leave(now))
     }
 
     /// Forwards the samples that still wait, as far as the lane's mode allows, and accounts for the rest.

@@ -28,6 +28,7 @@ use super::notify::{Meter, write_drops, write_list};
 use super::place::Place;
 use super::reload::ReloadRequests;
 use super::role::{Role, participant_options};
+use super::standby::Leave;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{InputTopic, Route, Settings};
@@ -79,13 +80,25 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
     let settings = &place.settings().clone();
     let mut ingress = Ingress::open(settings, place)?;
     info!(routes = settings.routes.len(), domain_id = settings.input.domain_id, "ingress is up");
-    while !stop.is_requested() {
+    let leave = loop {
+        if stop.is_requested() {
+            match ingress.identity.leave(clock::monotonic()) {
+                Leave::Soon => {}
+                leave => break leave,
+            }
+        }
         ingress.sleep();
         if let Err(error) = ingress.housekeeping(clock::monotonic()) {
             tracing::error!(%error, "housekeeping failed");
         }
-    }
+    };
     ingress.role.notifier.stopping();
+    if leave == Leave::HandOver {
+        info!("ingress hands over to its standby");
+        // As if it were killed: what is dropped would say goodbye, and give up the readers.
+        std::mem::forget(ingress);
+        return Ok(());
+    }
     ingress.identity.end();
     // Publishes the samples that DDS has received by now. The time limit is for publishers that keep sending.
     let give_up_at = clock::monotonic().plus_ms(LAST_SAMPLES_MS);
