@@ -30,6 +30,8 @@ pub(super) struct FormerSamples {
     pub next: Option<ShmSample>,
     /// Samples that a reader may lack if none is collected.
     pub unconfirmed: u64,
+    /// Whether they were looked for among those that ingress keeps.
+    pub has_read_backlog: bool,
     give_up_at: MonotonicNs,
     is_complete: bool,
 }
@@ -43,6 +45,7 @@ impl FormerSamples {
             collected: Vec::new(),
             next: None,
             unconfirmed,
+            has_read_backlog: false,
             give_up_at: now.plus_ms(WAIT_MS),
             is_complete: false,
         }
@@ -59,7 +62,8 @@ impl FormerSamples {
         self.logged.first().map_or(u64::MAX, |(_, sequence)| *sequence)
     }
 
-    /// Collects a sample if the former process has written it.
+    /// Collects a sample if the former process has written it and it was not collected yet. In the order of
+    /// their numbers.
     pub fn collect(
         &mut self,
         sample: ShmSample,
@@ -68,6 +72,9 @@ impl FormerSamples {
     ) {
         let header = *sample.header();
         let Some(number) = self.number_of(header.sequence) else { return };
+        if self.collected.last().is_some_and(|last| last.sequence >= header.sequence) {
+            return;
+        }
         let payload = payload(sample);
         let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
         let sample = FormerSample { number, payload, encapsulation, timestamp };

@@ -378,6 +378,7 @@ impl Output {
         } else {
             writer.write_from(publisher, payload, encapsulation, timestamp, header.key)
         };
+        self.catch_up.wrote(1);
         let complete = self.former_readers.is_empty();
         let done_at = clock::monotonic();
         let forwarded = Forwarded {

@@ -28,6 +28,8 @@ enum State {
 pub struct CatchUp {
     state: State,
     most_unacknowledged: u64,
+    /// Samples written since the lane fell behind.
+    written: u64,
     /// The readers that had fallen behind before the lane did.
     slow: Vec<Guid>,
 }
@@ -37,12 +39,12 @@ impl CatchUp {
     pub fn of_critical(window_samples: usize, now: MonotonicNs) -> Self {
         // The other half is for what a reader has not received of the samples that were sent.
         let most_unacknowledged = window_samples.div_ceil(2) as u64;
-        Self { state: State::Behind(now), most_unacknowledged, slow: Vec::new() }
+        Self { state: State::Behind(now), most_unacknowledged, written: 0, slow: Vec::new() }
     }
 
     /// Of a lane that takes the freshest samples.
     pub const fn never() -> Self {
-        Self { state: State::Never, most_unacknowledged: u64::MAX, slow: Vec::new() }
+        Self { state: State::Never, most_unacknowledged: u64::MAX, written: 0, slow: Vec::new() }
     }
 
     /// The most samples that may be on their way to a reader while the lane catches up, and the most that may
@@ -61,9 +63,15 @@ impl CatchUp {
     pub fn begin(&mut self, readers: impl IntoIterator<Item = ReaderRecord>, now: MonotonicNs) {
         if self.state == State::Level {
             self.state = State::Behind(now);
+            self.written = 0;
             let is_slow = |reader: &ReaderRecord| self.is_full(reader);
             self.slow = readers.into_iter().filter(is_slow).map(|reader| reader.reader).collect();
         }
+    }
+
+    /// The lane has written so many more samples.
+    pub const fn wrote(&mut self, samples: u64) {
+        self.written = self.written.saturating_add(samples);
     }
 
     /// The lane has taken all samples that wait.
@@ -93,9 +101,12 @@ impl CatchUp {
     }
 
     /// Whether a lane that catches up waits until this reader has acknowledged more. It does not wait for one
-    /// that had fallen behind before: that may be dead.
+    /// that had fallen behind before: that may be dead. Nor for acknowledgements of what the former process
+    /// sent, which a reader repeats some 5 ms after it has matched this one.
     pub fn waits_for(&self, reader: &ReaderRecord) -> bool {
-        self.is_full(reader) && !self.slow.contains(&reader.reader)
+        self.written >= self.most_unacknowledged
+            && self.is_full(reader)
+            && !self.slow.contains(&reader.reader)
     }
 
     const fn is_full(&self, reader: &ReaderRecord) -> bool {
@@ -136,6 +147,9 @@ mod tests {
         assert_eq!((lane.most_unacknowledged(), lane.burst_samples()), (128, 64));
         lane.end();
         lane.begin([reader(1, 128), reader(2, 127)], at(10));
+        lane.wrote(127);
+        assert!(!lane.waits_for(&reader(2, 256)), "most were sent before");
+        lane.wrote(1);
         let best_effort = ReaderRecord { reliable: 0, ..reader(3, 500) };
         let waits =
             [reader(1, 256), reader(2, 127), reader(2, 128), best_effort].map(|it| lane.waits_for(&it));
@@ -145,12 +159,15 @@ mod tests {
         assert!(lane.waits_for(&reader(2, 128)));
         lane.end();
         lane.begin([reader(1, 0), reader(2, 0)], at(30));
+        assert!(!lane.waits_for(&reader(1, 128)));
+        lane.wrote(128);
         assert!(lane.waits_for(&reader(1, 128)));
     }
 
     #[test]
     fn a_window_of_one_sample_is_one_on_its_way() {
-        let lane = CatchUp::of_critical(1, at(0));
+        let mut lane = CatchUp::of_critical(1, at(0));
+        lane.wrote(1);
         assert_eq!((lane.most_unacknowledged(), lane.burst_samples()), (1, 1));
         assert!(lane.waits_for(&reader(1, 1)) && !lane.waits_for(&reader(1, 0)));
     }

@@ -33,6 +33,12 @@ impl Output {
             let sample = match self.subscriber.take() {
                 Ok(Some(sample)) => sample,
                 Ok(None) | Err(TakeError::BorrowLimit) => {
+                    if !std::mem::replace(&mut former.has_read_backlog, true) {
+                        // Before ingress delivers to this queue.
+                        for earlier in self.backlog(former.first_sequence()..former.last_sequence() + 1) {
+                            former.collect(earlier, false, Bytes::from_owner);
+                        }
+                    }
                     // Ingress delivers the retained samples in their order.
                     let last = former.collected.last().map(|collected| collected.sequence);
                     if last == Some(former.last_sequence()) {
@@ -97,6 +103,7 @@ impl Output {
         }
         // The last one that was sent may not be there any more.
         self.tracker.record(last_logged);
+        self.catch_up.wrote(uncounted.len() as u64);
         let has_readers = !self.former_readers.is_empty();
         let (unsent, tracker) = (&mut self.unsent, &self.tracker);
         self.counters.update(|counters| {
