@@ -257,8 +257,10 @@ impl QosPolicies {
     self.durability
   }
 
+  /// Whether the DURABILITY is VOLATILE, which is the default (DDS v1.4 Section 2.2.3):
+  /// Cyclone DDS does not announce it.
   pub fn is_volatile(&self) -> bool {
-    matches!(self.durability, Some(policy::Durability::Volatile))
+    matches!(self.durability, None | Some(policy::Durability::Volatile))
   }
 
   pub const fn presentation(&self) -> Option<policy::Presentation> {
@@ -1282,3 +1284,16 @@ pub mod policy {
     }
   }
 } // mod policy
+
+#[cfg(test)]
+mod tests {
+  use super::*;
+
+  #[test]
+  fn a_reader_that_announces_no_durability_is_volatile() {
+    let with = |durability| QosPolicies::builder().durability(durability).build();
+    assert!(QosPolicies::builder().build().is_volatile());
+    assert!(with(policy::Durability::Volatile).is_volatile());
+    assert!(!with(policy::Durability::TransientLocal).is_volatile());
+  }
+}
