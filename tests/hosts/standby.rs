@@ -92,6 +92,8 @@ fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
         ("ingress", Signal::SIGSTOP),
         (lane, Signal::SIGTERM),
         ("ingress", Signal::SIGTERM),
+        (lane, Signal::SIGKILL),
+        ("ingress", Signal::SIGKILL),
     ];
     for (index, (name, sent)) in events.into_iter().enumerate() {
         let active = wait_standby(&bed, name);

@@ -82,11 +82,6 @@ impl CatchUp {
         }
     }
 
-    /// Whether the lane is not behind, and may be.
-    pub fn is_level(&self) -> bool {
-        self.state == State::Level
-    }
-
     /// Since when the lane has been behind.
     pub const fn since(&self) -> Option<MonotonicNs> {
         match self.state {
@@ -132,11 +127,11 @@ mod tests {
         assert!(lane.is_on(|| at(2_499)) && !lane.is_on(|| at(2_500)));
         // It has not taken all samples that wait.
         lane.begin([], at(9_000));
-        assert!(!lane.is_on(|| at(9_000)) && !lane.is_level());
+        assert!(!lane.is_on(|| at(9_000)));
         assert_eq!(lane.since(), Some(at(500)));
         lane.end();
         assert_eq!(lane.since(), None);
-        assert!(!lane.is_on(|| unreachable!("the clock is not read")) && lane.is_level());
+        assert!(!lane.is_on(|| unreachable!("the clock is not read")));
         lane.begin([], at(9_000));
         assert!(lane.is_on(|| at(10_999)) && !lane.is_on(|| at(11_000)));
     }
@@ -176,13 +171,8 @@ mod tests {
     fn a_lane_of_the_freshest_samples_never_catches_up() {
         let mut lane = CatchUp::never();
         lane.begin([], at(0));
-        assert!(
-            !lane.is_on(|| at(0))
-                && lane.since().is_none()
-                && !lane.is_level()
-                && !lane.waits_for(&reader(1, 500))
-        );
         lane.end();
-        assert!(!lane.is_level());
+        lane.begin([], at(0));
+        assert!(!lane.is_on(|| at(0)) && lane.since().is_none() && !lane.waits_for(&reader(1, 500)));
     }
 }

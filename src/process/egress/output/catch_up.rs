@@ -61,10 +61,8 @@ impl Output {
 
     /// The lane has not taken samples in time.
     pub(super) fn begin_catch_up(&mut self) {
-        if self.catch_up.is_level() {
-            let readers = self.writer.iter().flat_map(RawWriter::matched_readers);
-            self.catch_up.begin(readers, clock::monotonic());
-        }
+        let readers = self.writer.iter().flat_map(RawWriter::matched_readers);
+        self.catch_up.begin(readers, clock::monotonic());
     }
 
     /// The lane takes one more sample before its queue is empty.
