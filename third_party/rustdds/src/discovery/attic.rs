@@ -1,8 +1,9 @@
 //! Participants that are gone and may come back, with their readers and writers.
 //!
-//! The endpoints of each are one block of memory: their announcements as they go over the
-//! network. As values, those of a ROS 2 node are about a hundred allocations, which share their
-//! pages with others, so that the memory of a process grows although nothing is kept for long.
+//! What each has announced is kept as it goes over the network, in one block of memory for the
+//! participant and one for its endpoints. As values, the endpoints of a ROS 2 node are about a
+//! hundred allocations, which share their pages with others, so that the memory of a process grows
+//! although nothing is kept for long.
 
 use std::collections::VecDeque;
 
@@ -11,7 +12,7 @@ use super::{
   sedp_messages::{DiscoveredReaderData, DiscoveredWriterData},
   spdp_participant_data::SpdpDiscoveredParticipantData,
 };
-use crate::{serialization::pl_cdr_adapters::PlCdrDeserialize, structure::guid::GuidPrefix};
+use crate::{serialization::pl_cdr_adapters::{PlCdrDeserialize, PlCdrSerialize}, structure::guid::GuidPrefix};
 
 /// The one that has been gone for longest is forgotten if there are more.
 pub(crate) const MAX_PARTICIPANTS_IN_ATTIC: usize = 256;
@@ -33,7 +34,7 @@ struct Departed {
   prefix: GuidPrefix,
   endpoints: Box<[u8]>,
   /// Of a participant that did not say goodbye.
-  announcement: Option<Box<SpdpDiscoveredParticipantData>>,
+  announcement: Option<Box<[u8]>>,
 }
 
 /// The readers and writers of a participant.
@@ -61,10 +62,11 @@ impl Attic {
       append(&mut endpoints, WRITER, writer);
     }
     self.bytes += endpoints.len();
+    let announcement = announcement.and_then(|data| data.to_pl_cdr_bytes(ENCODING).ok());
     self.departed.push_back(Departed {
       prefix,
       endpoints: endpoints.as_slice().into(),
-      announcement: announcement.map(Box::new),
+      announcement: announcement.map(|bytes| bytes.as_ref().into()),
     });
     while self.departed.len() > MAX_PARTICIPANTS_IN_ATTIC || self.bytes > MAX_ATTIC_BYTES {
       let Some(forgotten) = self.departed.pop_front() else { return };
@@ -94,7 +96,7 @@ impl Attic {
   pub fn take_announcement(&mut self, prefix: GuidPrefix) -> Option<SpdpDiscoveredParticipantData> {
     let mut departed = self.departed.iter_mut();
     let departed = departed.find(|departed| departed.prefix == prefix)?;
-    departed.announcement.take().map(|data| *data)
+    SpdpDiscoveredParticipantData::from_pl_cdr_bytes(&departed.announcement.take()?, ENCODING).ok()
   }
 
   #[cfg(test)]
@@ -195,8 +197,9 @@ mod tests {
     let known = endpoints(participant.participant_guid);
     attic.remember(prefix, &known, Some(participant.clone()));
     assert!(attic.contains(prefix));
-    let announcement = attic.take_announcement(prefix).unwrap();
-    assert_eq!(announcement.participant_guid, participant.participant_guid);
+    let mut announcement = attic.take_announcement(prefix).unwrap();
+    announcement.updated_time = participant.updated_time; // it is not announced
+    assert_eq!(announcement, participant);
     assert!(attic.take_announcement(prefix).is_none() && attic.contains(prefix));
     let (readers, mut writers) = attic.take(prefix).unwrap();
     assert_eq!(readers, known.0);

@@ -1128,7 +1128,7 @@ impl DPEventLoop {
     self
       .interface_observations
       .borrow_mut()
-      .remove(participant_guid_prefix);
+      .remove(participant_guid_prefix, Instant::now());
 
     #[cfg(feature = "security")]
     if let Some(security_plugins_handle) = &self.security_plugins_opt {

@@ -27,7 +27,10 @@ use std::{
   time::{Duration, Instant},
 };
 
-use crate::structure::{guid::GuidPrefix, locator::Locator};
+use crate::{
+  network_counts::MAX_LEASE,
+  structure::{guid::GuidPrefix, locator::Locator},
+};
 
 /// Hysteresis margin for switching a remote participant's chosen multicast
 /// egress interface. Once an interface is chosen it stays chosen until we have
@@ -103,6 +106,8 @@ pub struct ObservedRoutes {
   /// Most recent source socket address seen for this participant, regardless of
   /// whether the receiving interface could be determined.
   last_source: Option<SocketAddr>,
+  /// When its last datagram arrived.
+  last_seen: Option<Instant>,
   /// The interface currently chosen for multicast egress to this participant.
   /// Updated with hysteresis (see [`STICKY_SWITCH_MARGIN`]) so it does not flip
   /// on a single stray packet arriving on another interface.
@@ -133,6 +138,7 @@ impl ObservedRoutes {
     margin: Duration,
   ) {
     self.last_source = Some(source);
+    self.last_seen = Some(now);
     if source.ip().is_loopback() {
       self.seen_from_own_address = true;
     }
@@ -288,8 +294,13 @@ impl InterfaceObservations {
     self.by_participant.get(&prefix)
   }
 
-  pub fn remove(&mut self, prefix: GuidPrefix) {
+  /// The participant is gone, and so is each that has been silent for longer than any
+  /// lease: a datagram that arrives after a participant's goodbye makes a new entry.
+  pub fn remove(&mut self, prefix: GuidPrefix, now: Instant) {
     self.by_participant.remove(&prefix);
+    self.by_participant.retain(|_, routes| {
+      routes.last_seen.is_some_and(|last| now.saturating_duration_since(last) <= MAX_LEASE)
+    });
   }
 }
 
@@ -584,6 +595,21 @@ mod tests {
     assert!(!set.insert(k2)); // duplicate
     assert!(set.insert(k3));
     assert_eq!(set.len(), 2);
+  }
+
+  #[test]
+  fn what_was_observed_of_participants_that_are_gone_is_forgotten() {
+    let mut observations = InterfaceObservations::new();
+    let prefixes = [1, 2, 3].map(|number| GuidPrefix::new(&[number; 12]));
+    for prefix in prefixes {
+      observations.record(prefix, None, "192.0.2.1:7410".parse().unwrap());
+    }
+    let now = Instant::now();
+    observations.remove(prefixes[0], now);
+    let known = prefixes.map(|prefix| observations.get(prefix).is_some());
+    assert_eq!(known, [false, true, true]);
+    observations.remove(prefixes[1], now + MAX_LEASE + Duration::from_secs(1));
+    assert!(observations.by_participant.is_empty());
   }
 
   #[test]

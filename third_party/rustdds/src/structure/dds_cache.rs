@@ -657,6 +657,11 @@ impl TopicCache {
   }
 
   #[cfg(test)]
+  pub(crate) fn sample_count(&self) -> usize {
+    self.changes.len()
+  }
+
+  #[cfg(test)]
   pub(crate) fn max_keep_samples(&self) -> i32 {
     self.max_keep_samples
   }
