@@ -12,11 +12,11 @@ use super::options::{Case, Options, SCAN};
 use super::out::{Output, RowKey};
 use super::system::{Usage, descriptors};
 
-/// The part of each turn in which scans are sent. With the rest of the turn a minute, the time after which
-/// publisher and subscriber are restarted.
-const SCANS_S: f64 = 30.0;
+/// The part of each turn in which scans are sent. With the rest of the turn 20 s, the time after which
+/// publisher and subscriber are restarted: in 90 minutes as often as in four hours with a restart a minute.
+const SCANS_S: f64 = 10.0;
 /// The part of each turn in which point clouds are sent, which the bridge forwards by reference.
-const CLOUDS_S: f64 = 25.0;
+const CLOUDS_S: f64 = 8.0;
 
 /// How often publisher and subscriber are restarted before the measurement. The bridge remembers the
 /// endpoints of the last 256 participants that are gone; with one restart a minute, two participants each, it

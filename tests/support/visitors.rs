@@ -76,6 +76,8 @@ pub enum Leave {
     Close,
     /// It disposes only itself.
     CloseParticipant,
+    /// It disposes itself and then its endpoints.
+    CloseParticipantFirst,
     /// It sends nothing more, as a program that is killed, after it has shortened its lease.
     Kill,
 }
@@ -206,25 +208,32 @@ impl Visitors {
                     self.announce_participant(prefix, 2, LAST_LEASE_S, *discovery);
                     continue;
                 }
-                let to = || Message::of(prefix).to(*participant);
+                let goodbye = Message::of(prefix).to(*participant);
+                let goodbye = goodbye.dispose(SPDP_READER, SPDP_WRITER, 2, &guid(prefix, PARTICIPANT));
                 if *way == Leave::Close {
-                    for writers in [true, false] {
-                        let (reader, writer) = if writers { SEDP_PUBLICATIONS } else { SEDP_SUBSCRIPTIONS };
-                        let endpoints = self.endpoints.iter().enumerate();
-                        let ours: Vec<_> = endpoints.filter(|(_, one)| one.is_writer == writers).collect();
-                        let mut sequence = ours.len() as i64;
-                        let mut message = to();
-                        for (number, endpoint) in ours {
-                            sequence += 1;
-                            let key = guid(prefix, endpoint.entity(number));
-                            message = message.dispose(reader, writer, sequence, &key);
-                        }
-                        self.resident.send(&message.heartbeat(reader, writer, 1, sequence, 2), *discovery);
-                    }
+                    self.dispose_endpoints(prefix, *participant, *discovery);
                 }
-                let goodbye = to().dispose(SPDP_READER, SPDP_WRITER, 2, &guid(prefix, PARTICIPANT));
                 self.resident.send(&goodbye, *discovery);
+                if *way == Leave::CloseParticipantFirst {
+                    self.dispose_endpoints(prefix, *participant, *discovery);
+                }
             }
+        }
+    }
+
+    fn dispose_endpoints(&self, prefix: Prefix, participant: Prefix, discovery: SocketAddrV4) {
+        for writers in [true, false] {
+            let (reader, writer) = if writers { SEDP_PUBLICATIONS } else { SEDP_SUBSCRIPTIONS };
+            let endpoints = self.endpoints.iter().enumerate();
+            let ours: Vec<_> = endpoints.filter(|(_, one)| one.is_writer == writers).collect();
+            let mut sequence = ours.len() as i64;
+            let mut message = Message::of(prefix).to(participant);
+            for (number, endpoint) in ours {
+                sequence += 1;
+                let key = guid(prefix, endpoint.entity(number));
+                message = message.dispose(reader, writer, sequence, &key);
+            }
+            self.resident.send(&message.heartbeat(reader, writer, 1, sequence, 2), discovery);
         }
     }
 }

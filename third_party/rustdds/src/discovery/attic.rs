@@ -1,18 +1,19 @@
 //! Participants that are gone and may come back, with their readers and writers.
 //!
-//! What each has announced is kept as it goes over the network, in one block of memory for the
-//! participant and one for its endpoints. As values, the endpoints of a ROS 2 node are about a
-//! hundred allocations, which share their pages with others, so that the memory of a process grows
-//! although nothing is kept for long.
+//! What each has announced is one block of memory: its announcements as they go over the network.
+//! As values, those of a ROS 2 node are about a hundred allocations, which share their pages with
+//! others, so that the memory of a process grows although nothing is kept for long. The block has
+//! the participant's announcement also after a goodbye, for which nobody asks then: so a
+//! process needs the same memory however participants leave.
 
 use std::collections::VecDeque;
 
 use super::{
-  journal::{append, next_record, ENCODING, READER},
+  journal::{append, next_record, ENCODING, PARTICIPANT, READER},
   sedp_messages::{DiscoveredReaderData, DiscoveredWriterData},
   spdp_participant_data::SpdpDiscoveredParticipantData,
 };
-use crate::{serialization::pl_cdr_adapters::{PlCdrDeserialize, PlCdrSerialize}, structure::guid::GuidPrefix};
+use crate::{serialization::pl_cdr_adapters::PlCdrDeserialize, structure::guid::GuidPrefix};
 
 /// The one that has been gone for longest is forgotten if there are more.
 pub(crate) const MAX_PARTICIPANTS_IN_ATTIC: usize = 256;
@@ -32,9 +33,10 @@ pub(crate) struct Attic {
 
 struct Departed {
   prefix: GuidPrefix,
-  endpoints: Box<[u8]>,
-  /// Of a participant that did not say goodbye.
-  announcement: Option<Box<[u8]>>,
+  /// The participant's announcement, if it is known, and those of its endpoints.
+  announced: Box<[u8]>,
+  /// Whether it has said no goodbye, and its announcement has not been taken.
+  may_return: bool,
 }
 
 /// The readers and writers of a participant.
@@ -46,31 +48,34 @@ impl Attic {
     self.departed.iter().any(|departed| departed.prefix == prefix)
   }
 
-  /// Remembers a participant that is not in the attic. Its announcement is for
-  /// [`Self::take_announcement`].
+  /// Remembers a participant that is not in the attic; whether it `may_return`, so that its
+  /// announcement is for [`Self::take_announcement`].
   pub fn remember(
     &mut self,
     prefix: GuidPrefix,
     (readers, writers): &Endpoints,
-    announcement: Option<SpdpDiscoveredParticipantData>,
+    announcement: Option<&SpdpDiscoveredParticipantData>,
+    may_return: bool,
   ) {
-    let mut endpoints = Vec::new();
+    let mut announced = Vec::new();
+    if let Some(announcement) = announcement {
+      append(&mut announced, PARTICIPANT, announcement);
+    }
     for reader in readers {
-      append(&mut endpoints, READER, reader);
+      append(&mut announced, READER, reader);
     }
     for writer in writers {
-      append(&mut endpoints, WRITER, writer);
+      append(&mut announced, WRITER, writer);
     }
-    self.bytes += endpoints.len();
-    let announcement = announcement.and_then(|data| data.to_pl_cdr_bytes(ENCODING).ok());
+    self.bytes += announced.len();
     self.departed.push_back(Departed {
       prefix,
-      endpoints: endpoints.as_slice().into(),
-      announcement: announcement.map(|bytes| bytes.as_ref().into()),
+      announced: announced.as_slice().into(),
+      may_return,
     });
     while self.departed.len() > MAX_PARTICIPANTS_IN_ATTIC || self.bytes > MAX_ATTIC_BYTES {
       let Some(forgotten) = self.departed.pop_front() else { return };
-      self.bytes -= forgotten.endpoints.len();
+      self.bytes -= forgotten.announced.len();
     }
   }
 
@@ -78,14 +83,14 @@ impl Attic {
   pub fn take(&mut self, prefix: GuidPrefix) -> Option<Endpoints> {
     let place = self.departed.iter().position(|departed| departed.prefix == prefix)?;
     let departed = self.departed.remove(place)?;
-    self.bytes -= departed.endpoints.len();
-    let mut records = &departed.endpoints[..];
+    self.bytes -= departed.announced.len();
+    let mut records = &departed.announced[..];
     let (mut readers, mut writers) = Endpoints::default();
     while let Some((kind, bytes)) = next_record(&mut records) {
-      if kind == READER {
-        readers.extend(DiscoveredReaderData::from_pl_cdr_bytes(bytes, ENCODING));
-      } else {
-        writers.extend(DiscoveredWriterData::from_pl_cdr_bytes(bytes, ENCODING));
+      match kind {
+        READER => readers.extend(DiscoveredReaderData::from_pl_cdr_bytes(bytes, ENCODING)),
+        WRITER => writers.extend(DiscoveredWriterData::from_pl_cdr_bytes(bytes, ENCODING)),
+        _ => {}
       }
     }
     Some((readers, writers))
@@ -96,7 +101,12 @@ impl Attic {
   pub fn take_announcement(&mut self, prefix: GuidPrefix) -> Option<SpdpDiscoveredParticipantData> {
     let mut departed = self.departed.iter_mut();
     let departed = departed.find(|departed| departed.prefix == prefix)?;
-    SpdpDiscoveredParticipantData::from_pl_cdr_bytes(&departed.announcement.take()?, ENCODING).ok()
+    if !std::mem::take(&mut departed.may_return) {
+      return None;
+    }
+    let (kind, bytes) = next_record(&mut &departed.announced[..])?;
+    let announcement = SpdpDiscoveredParticipantData::from_pl_cdr_bytes(bytes, ENCODING);
+    announcement.ok().filter(|_| kind == PARTICIPANT)
   }
 
   #[cfg(test)]
@@ -195,7 +205,7 @@ mod tests {
     let participant = new_participant();
     let prefix = participant.participant_guid.prefix;
     let known = endpoints(participant.participant_guid);
-    attic.remember(prefix, &known, Some(participant.clone()));
+    attic.remember(prefix, &known, Some(&participant), true);
     assert!(attic.contains(prefix));
     let mut announcement = attic.take_announcement(prefix).unwrap();
     announcement.updated_time = participant.updated_time; // it is not announced
@@ -207,5 +217,18 @@ mod tests {
     assert_eq!(writers, known.1);
     assert!(attic.take(prefix).is_none() && !attic.contains(prefix));
     assert_eq!(attic.bytes(), 0);
+  }
+
+  #[test]
+  fn a_participant_that_said_goodbye_or_was_never_announced_is_not_announced() {
+    let participant = new_participant();
+    let prefix = participant.participant_guid.prefix;
+    let known = endpoints(participant.participant_guid);
+    for (announcement, may_return) in [(Some(&participant), false), (None, true)] {
+      let mut attic = Attic::default();
+      attic.remember(prefix, &known, announcement, may_return);
+      assert!(attic.take_announcement(prefix).is_none());
+      assert_eq!(attic.take(prefix).unwrap().0, known.0);
+    }
   }
 }

@@ -345,8 +345,6 @@ impl DiscoveryDB {
 
     self.forget_topics_of(guid_prefix);
 
-    // A datagram that it sent before it said goodbye is no sign of life.
-    let announcement = participant_data.filter(|_| !active_disposal);
     let is_known = is_present || self.restore_endpoints_of(guid_prefix);
     let endpoints = (
       take_by_guid_prefix(guid_prefix, &mut self.external_topic_readers),
@@ -356,7 +354,9 @@ impl DiscoveryDB {
       // Endpoints of a participant that was never discovered are not remembered.
       return !endpoints.0.is_empty() || !endpoints.1.is_empty();
     }
-    self.attic.remember(guid_prefix, &endpoints, announcement);
+    // A datagram that it sent before it said goodbye is no sign of life.
+    let may_return = !active_disposal;
+    self.attic.remember(guid_prefix, &endpoints, participant_data.as_ref(), may_return);
     true
   }
 

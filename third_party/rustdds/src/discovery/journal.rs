@@ -22,7 +22,7 @@ pub(crate) const MAX_JOURNAL_BYTES: usize = 256 << 10;
 pub(crate) const ENCODING: RepresentationIdentifier = RepresentationIdentifier::PL_CDR_LE;
 // The kinds of records. A record is its kind, the length of the announcement, and the
 // announcement as it goes over the network, without an encapsulation header.
-const PARTICIPANT: u8 = 1;
+pub(crate) const PARTICIPANT: u8 = 1;
 pub(crate) const READER: u8 = 2;
 const WRITER: u8 = 3;
 
