@@ -46,6 +46,9 @@ const STORE: &str = "FDSTORE=1\nFDNAME=dds\nFDPOLL=0";
 /// Asks to close all kept sockets.
 const FORGET: &str = "FDSTOREREMOVE=1\nFDNAME=dds";
 
+/// Says that the process ends on request, so that its standby knows why.
+const STOPPING: &str = "STOPPING=1";
+
 /// More than the file descriptors that the kernel lets one message have (253), so that none is cut off.
 const MAX_ATTACHED: usize = 256;
 
@@ -91,6 +94,12 @@ pub(super) fn take_back(connection: BorrowedFd<'_>) {
     let _ = send(connection.as_raw_fd(), FORGET, &[]);
 }
 
+/// Says to a standby that this process ends because it was asked to.
+pub(super) fn say_stopping(connection: BorrowedFd<'_>) {
+    // A connection that has ended has no standby.
+    let _ = send(connection.as_raw_fd(), STOPPING, &[]);
+}
+
 /// Makes the supervisor close the sockets that it keeps for this process.
 pub(super) fn forget() {
     if let Err(error) = send_to_supervisor(FORGET, &[]) {
@@ -98,10 +107,12 @@ pub(super) fn forget() {
     }
 }
 
-/// What a process asks of its supervisor.
+/// What a process asks of its supervisor, or tells its standby.
 pub(super) enum Request {
     Store(Vec<UdpSocket>),
     Forget,
+    /// It ends on request.
+    Stopping,
     /// A message that has no meaning here, or the end of a connection.
     Unknown,
 }
@@ -131,6 +142,7 @@ pub(super) fn receive(socket: &impl AsRawFd) -> Option<Request> {
             Request::Store(fds.into_iter().map(Into::into).collect())
         }
         Some(text) if text == FORGET.as_bytes() => Request::Forget,
+        Some(text) if text == STOPPING.as_bytes() => Request::Stopping,
         _ => Request::Unknown,
     })
 }

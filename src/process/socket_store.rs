@@ -42,7 +42,9 @@ impl SocketStore {
             match request {
                 Request::Store(sockets) => sockets.into_iter().for_each(|socket| self.keep(socket)),
                 Request::Forget => self.close(),
-                Request::Unknown => debug!("ignored a message from a child that is no request"),
+                Request::Stopping | Request::Unknown => {
+                    debug!("ignored a message from a child that is no request")
+                }
             }
         }
     }

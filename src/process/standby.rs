@@ -28,8 +28,8 @@ use super::notify::Notifier;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::Settings;
-use crate::model::{MonotonicNs, StandbyRecord};
-use crate::policy::may_fence;
+use crate::model::{MonotonicNs, StandbyRecord, TakeOverCause};
+use crate::policy::{may_fence, take_overs_in_a_row};
 use crate::shm::{BoardWriter, Boards, ProcessRole, RoleLock, ShmError, root_of};
 use crate::telemetry::StatFile;
 
@@ -70,6 +70,8 @@ pub(super) struct Waiting {
     sockets: Vec<UdpSocket>,
     /// Whether the active process has said that its sockets are not to be used by the next one.
     is_taken_back: bool,
+    /// Why the active process ends, or has ended.
+    cause: TakeOverCause,
     ended_at: MonotonicNs,
     /// Whether it kills an active process that is stopped.
     fences: bool,
@@ -108,6 +110,7 @@ pub(super) struct TakeOver {
     board: BoardWriter<StandbyRecord>,
     /// The sockets of the former process.
     pub sockets: Vec<UdpSocket>,
+    cause: TakeOverCause,
     ended_at: MonotonicNs,
 }
 
@@ -147,6 +150,7 @@ impl Waiting {
             active: None,
             sockets: Vec::new(),
             is_taken_back: false,
+            cause: TakeOverCause::Ended,
             ended_at: MonotonicNs(0),
             fences: std::env::var_os(NO_WATCHDOG_VARIABLE).is_none(),
         }))
@@ -208,7 +212,7 @@ impl Waiting {
         }
         let Some(active) = &self.active else {
             match self.listener.accept().and_then(|(connection, _)| Active::of(connection.into())) {
-                Ok(active) => self.active = Some(active),
+                Ok(active) => (self.active, self.cause) = (Some(active), TakeOverCause::Ended),
                 Err(error) => warn!(%error, "standby: a connection of the active process failed"),
             }
             return Ok(());
@@ -219,6 +223,7 @@ impl Waiting {
                 self.sockets.clear();
                 self.is_taken_back = true;
             }
+            Some(Request::Stopping) => self.cause = TakeOverCause::HandedOver,
             Some(Request::Unknown) | None => self.active = None,
         }
         Ok(())
@@ -234,8 +239,9 @@ impl Waiting {
             return;
         }
         warn!(role = name, pid = active.pid.as_raw(), "standby: kills the active process, which is stopped");
-        if let Err(error) = kill(active.pid, Signal::SIGKILL) {
-            warn!(role = name, %error, "standby: cannot kill the active process");
+        match kill(active.pid, Signal::SIGKILL) {
+            Ok(()) => self.cause = TakeOverCause::Stopped,
+            Err(error) => warn!(role = name, %error, "standby: cannot kill the active process"),
         }
     }
 
@@ -260,8 +266,8 @@ impl Waiting {
     }
 
     pub fn take_over(self) -> TakeOver {
-        let Self { lock, board, sockets, ended_at, .. } = self;
-        TakeOver { _lock: lock, board, sockets, ended_at }
+        let Self { lock, board, sockets, cause, ended_at, .. } = self;
+        TakeOver { _lock: lock, board, sockets, cause, ended_at }
     }
 }
 
@@ -269,16 +275,18 @@ impl TakeOver {
     /// Records that the process has completed its first turn; then another one may wait for the role.
     pub fn complete(mut self) {
         let now = clock::monotonic();
-        let took_ns = now.since(self.ended_at);
+        let (cause, took_ns) = (self.cause, now.since(self.ended_at));
         self.board.update(|board| {
             *board = StandbyRecord {
                 take_overs: board.take_overs + 1,
                 taken_over_at: now,
                 took_ns,
+                in_a_row: take_overs_in_a_row(board, cause, now),
+                cause: cause as u8,
                 ..StandbyRecord::default()
             };
         });
-        info!(took_ms = took_ns as f64 / 1e6, "standby: has taken the role over");
+        info!(%cause, took_ms = took_ns as f64 / 1e6, "standby: has taken the role over");
     }
 }
 
@@ -340,7 +348,13 @@ impl Successor {
             return Leave::ForGood;
         }
         let leave_at = *self.leave_at.get_or_insert(now.plus_ms(LEAVE_MS));
-        if now < leave_at { Leave::Soon } else { Leave::HandOver }
+        if now < leave_at {
+            return Leave::Soon;
+        }
+        if let Some(connection) = &self.connection {
+            kept_sockets::say_stopping(connection.as_fd());
+        }
+        Leave::HandOver
     }
 
     /// Connects to a standby that has none of the sockets. Never waits; some 5 µs without a standby.
@@ -409,6 +423,9 @@ mod tests {
         let (connection, _) = standby.accept().unwrap();
         assert_eq!(active.leave(at(1_000 + LEAVE_MS - 1)), Leave::Soon);
         assert_eq!(active.leave(at(1_000 + LEAVE_MS)), Leave::HandOver);
+        let received = || kept_sockets::receive(&connection);
+        assert!(matches!(received(), Some(Request::Store(sockets)) if sockets.len() == 1));
+        assert!(matches!(received(), Some(Request::Stopping)));
         drop((connection, standby));
         assert_eq!(active.leave(at(1_000 + LEAVE_MS)), Leave::ForGood, "the standby has ended");
     }

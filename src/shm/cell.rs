@@ -52,7 +52,7 @@ macro_rules! plain {
 }
 
 plain! {
-    StandbyRecord: 5,
+    StandbyRecord: 6 + 1,
     ProcessHealth: 12 + NetworkRefusal::COUNT,
     ControlRecord: 7 + ProbeRefusal::COUNT + 5 + 1 + 16,
     SubscriberRecord: 16 + 9 + 1 + 16,

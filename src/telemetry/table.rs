@@ -11,7 +11,7 @@ use super::report::{
 };
 use super::snapshot::ProcessReading;
 use super::text::{bytes_text, counted, wrapped};
-use crate::model::{DropCounts, PublisherAccount};
+use crate::model::{DropCounts, PublisherAccount, TakeOverCause};
 
 /// The maximum length of a line. Only a single word, such as a long topic name in a problem, may exceed it.
 const COLUMNS: usize = 100;
@@ -303,10 +303,19 @@ fn process_text(process: &ProcessReport) -> String {
     if process.reading.standby.take_overs > 0 {
         let took_ms = process.reading.standby.took_ns as f64 / 1e6;
         let take_overs = counted(process.reading.standby.take_overs, "take-over");
-        let _ = write!(standby, ", {take_overs} (the last in {took_ms:.0} ms)");
+        let cause = process.reading.standby.cause().map_or("", take_over_cause);
+        let _ = write!(standby, ", {take_overs} (the last{cause}: {took_ms:.0} ms)");
     }
     let up = process.uptime_s.map_or(String::new(), |uptime_s| format!(", up {}", duration_text(uptime_s)));
     format!("process {} {}{up}, {restarts}{standby}{failures}", health.pid, state.label())
+}
+
+fn take_over_cause(cause: TakeOverCause) -> &'static str {
+    match cause {
+        TakeOverCause::Ended => ", as the former process ended",
+        TakeOverCause::Stopped => ", as the former process was stopped",
+        TakeOverCause::HandedOver => ", on request",
+    }
 }
 
 fn topic_text(topic: &str) -> String {

@@ -108,7 +108,14 @@ fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
             process(status, name)["standby"]["take_overs"] == take_overs
         });
         all_receive(100);
-        let took_ms = number(&process(&status, name)["standby"]["took_ns"]) as f64 / 1e6;
+        let standby = process(&status, name)["standby"].clone();
+        let cause = match sent {
+            Signal::SIGSTOP => "stopped",
+            Signal::SIGTERM => "handed_over",
+            _ => "ended",
+        };
+        assert_eq!(standby["cause"], cause, "{name}, {sent}: {standby}");
+        let took_ms = number(&standby["took_ns"]) as f64 / 1e6;
         let pause_ms = pauses_ms(watched, before.saturating_sub(10)).into_iter().fold(0.0, f64::max);
         println!("{name}, {sent}: taken over in {took_ms:.1} ms, longest pause {pause_ms:.1} ms");
     }

@@ -30,6 +30,7 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     let mut problems = Vec::new();
     for process in &now.processes {
         problems.extend(processes::problem(process, now, before));
+        problems.extend(processes::take_over_storm(process, now));
     }
     problems.extend(control::missing(now));
     problems.extend(control::without_secret(now));
@@ -265,7 +266,7 @@ pub(super) mod tests {
     use crate::model::{
         ControlRecord, Guid, IngressCounters, InstanceName, LaneCounters, LaneName, LanePolicy,
         LatencyHistogram, ModeReason, MonotonicNs, OutputReaders, ProcessHealth, ReaderRecord, RouteId,
-        RouteInfo, StandbyRecord, TopicName, WallNs,
+        RouteInfo, StandbyRecord, TakeOverCause, TopicName, WallNs,
     };
 
     /// A bridge without problems: one route and two lanes, each of which has forwarded 100 samples.
@@ -374,6 +375,27 @@ pub(super) mod tests {
                 "egress-critical was restarted 2 times in the last 1.0 s; read its log for the cause",
                 "egress-noncritical (pid 7) is dead: lane noncritical forwards nothing; read its log, and if it is not \
                  restarted automatically, start its service or run `adaptive-bridge egress --lane noncritical`",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_standby_that_takes_over_again_and_again_is_a_problem() {
+        let take_overs = |in_a_row| {
+            problems_after(|now| {
+                let taken_over_at = MonotonicNs(now.at.0 - 1);
+                let cause = TakeOverCause::Ended as u8;
+                let standby = &mut now.processes[1].standby;
+                *standby = StandbyRecord { taken_over_at, in_a_row, cause, ..StandbyRecord::default() };
+            })
+        };
+        assert_eq!(take_overs(4), [""; 0]);
+        assert_eq!(
+            take_overs(5),
+            [
+                "the standby of egress-critical took over 5 times, each time within a minute of the last, because the \
+                 active process ended: read its log for the cause; samples are lost when it fails before the next standby \
+                 has started",
             ]
         );
     }

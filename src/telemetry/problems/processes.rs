@@ -1,6 +1,8 @@
 //! Problems of the bridge's processes.
 
 use super::{Level, Problem};
+use crate::model::TakeOverCause;
+use crate::policy::is_take_over_storm;
 use crate::shm::ProcessRole;
 use crate::telemetry::liveness::ProcessState;
 use crate::telemetry::snapshot::{ProcessReading, Snapshot};
@@ -57,6 +59,23 @@ pub(super) fn problem(process: &ProcessReading, now: &Snapshot, before: &Snapsho
         }
     };
     Some(Problem::new(about, Level::Error, text))
+}
+
+/// The problem of a process whose standby has to take over again and again.
+pub(super) fn take_over_storm(process: &ProcessReading, now: &Snapshot) -> Option<Problem> {
+    let standby = &process.standby;
+    let what = match standby.cause()? {
+        TakeOverCause::Stopped => "was stopped by a signal",
+        TakeOverCause::Ended | TakeOverCause::HandedOver => "ended",
+    };
+    is_take_over_storm(standby, now.at).then(|| {
+        let text = format!(
+            "the standby of {} took over {} times, each time within a minute of the last, because the active process \
+             {what}: read its log for the cause; samples are lost when it fails before the next standby has started",
+            process.name, standby.in_a_row
+        );
+        Problem::new(about(process, now), Level::Warn, text)
+    })
 }
 
 /// The part that a problem of this process is about.

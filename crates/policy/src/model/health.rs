@@ -1,9 +1,10 @@
 //! Records that the processes write to their boards: plain data of fixed size, which a reader can use even
 //! after the process that wrote them has died. What `status --json` shows of them is serialized.
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use super::drops::DropCounts;
+use super::modes::TakeOverCause;
 use super::names::TopicName;
 use super::network::NetworkRefusals;
 use super::qos::Durability;
@@ -257,6 +258,25 @@ pub struct StandbyRecord {
     /// How long it took: from the end of the former process to the first turn of the next one, in
     /// nanoseconds.
     pub took_ns: u64,
+    /// How many take-overs followed each other within a minute, up to the last one. Hand-overs do not count.
+    pub in_a_row: u64,
+    /// Why the last one happened, as [`TakeOverCause`]'s number; 0 if none has.
+    #[serde(serialize_with = "cause_label")]
+    pub cause: u8,
+    /// Always 0.
+    #[serde(skip)]
+    pub reserved: [u8; 7],
+}
+
+impl StandbyRecord {
+    /// Why the last take-over happened; `None` if none has.
+    pub const fn cause(&self) -> Option<TakeOverCause> {
+        TakeOverCause::from_u8(self.cause)
+    }
+}
+
+fn cause_label<S: Serializer>(number: &u8, serializer: S) -> Result<S::Ok, S::Error> {
+    TakeOverCause::from_u8(*number).map(TakeOverCause::label).serialize(serializer)
 }
 
 /// The policy of one lane on the policy board: control's decision, the floor of the safety supervisor and an

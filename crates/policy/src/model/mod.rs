@@ -38,7 +38,9 @@ pub use health::{
     PublisherAccount, RouteInfo, StandbyRecord,
 };
 pub use identity::{EndpointIdentity, ProcessIdentity};
-pub use modes::{LaneMode, ModeReason, SafetyMode, SubscriberState, TrafficClass, UnmatchedPolicy};
+pub use modes::{
+    LaneMode, ModeReason, SafetyMode, SubscriberState, TakeOverCause, TrafficClass, UnmatchedPolicy,
+};
 pub use names::{InstanceName, LaneName, NameError, NodeName, RouteId, TopicName, TypeName};
 pub use network::{NetworkRefusal, NetworkRefusals};
 pub use partial::PartialSample;

@@ -127,6 +127,17 @@ numbered! {
 }
 
 numbered! {
+    /// Why a standby has taken its role over.
+    TakeOverCause:
+    /// The active process has ended: it crashed or was killed.
+    Ended = 1, "ended",
+    /// A signal had stopped the active process, and the standby killed it.
+    Stopped = 2, "stopped",
+    /// The active process was asked to end, and handed the role over.
+    HandedOver = 3, "handed_over",
+}
+
+numbered! {
     /// The safety supervisor's mode of the whole bridge.
     #[derive(Default)]
     SafetyMode:

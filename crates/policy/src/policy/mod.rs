@@ -7,7 +7,6 @@ mod catch_up;
 mod classifier;
 mod clock_offset;
 mod cut_through;
-mod fencing;
 mod intruders;
 mod lane;
 mod lane_mode;
@@ -22,6 +21,7 @@ mod route_places;
 mod safety;
 mod sequence;
 mod staleness;
+mod take_overs;
 mod token_bucket;
 mod warnings;
 
@@ -34,7 +34,6 @@ pub use classifier::{
 };
 pub use clock_offset::ClockOffset;
 pub use cut_through::{MIN_CUT_THROUGH_BYTES, begins_early, step_bytes};
-pub use fencing::may_fence;
 pub use intruders::{
     Guarded, GuardedTopic, Intruder, IntruderEvent, IntruderWatch, MAX_GUARDED_TOPICS,
     MAX_REMEMBERED_INTRUDERS, NODE_NAME_TIMEOUT_MS, REMEMBER_MS,
@@ -58,5 +57,6 @@ pub use safety::{
 };
 pub use sequence::{SequenceOutcome, SequenceTracker};
 pub use staleness::{age_ns, is_stale};
+pub use take_overs::{is_take_over_storm, may_fence, take_overs_in_a_row};
 pub use token_bucket::{BURST_WINDOW_NS, ByteBudget, MAX_RATE_HZ, TokenBucket, burst_for};
 pub use warnings::{SubscriberWarnings, WarningThresholds};

@@ -1,0 +1,75 @@
+//! When a standby kills an active process that is stopped, and when take-overs are too many.
+
+use crate::model::{MonotonicNs, StandbyRecord, TakeOverCause};
+
+/// The shortest time between two take-overs that a standby causes. A process that has taken an identity over
+/// leaves none if it ends within a second.
+const PAUSE_MS: u64 = 1_500;
+
+/// The longest time between two take-overs in a row.
+const IN_A_ROW_MS: u64 = 60_000;
+
+/// How many take-overs in a row are a storm.
+const STORM: u64 = 5;
+
+/// Whether a standby may kill a process that is stopped, `now`, when its role was last taken over at
+/// `taken_over_at` (0: never). A program that stops each process causes at most 40 take-overs a minute.
+pub const fn may_fence(taken_over_at: MonotonicNs, now: MonotonicNs) -> bool {
+    taken_over_at.0 == 0 || now.since(taken_over_at) >= PAUSE_MS * 1_000_000
+}
+
+/// How many take-overs have followed each other within a minute, with one that happens `now` for `cause`
+/// after those of `former`. A process that was asked to end hands over without a fault, which does not count.
+pub fn take_overs_in_a_row(former: &StandbyRecord, cause: TakeOverCause, now: MonotonicNs) -> u64 {
+    let before = if is_recent(former, now) { former.in_a_row } else { 0 };
+    before.saturating_add((cause != TakeOverCause::HandedOver).into())
+}
+
+/// Whether the active process of a role fails again and again, `now`: subscribers miss no sample as long as a
+/// standby is there in time, but its start takes longer than the process lives.
+pub const fn is_take_over_storm(record: &StandbyRecord, now: MonotonicNs) -> bool {
+    is_recent(record, now) && record.in_a_row >= STORM
+}
+
+const fn is_recent(record: &StandbyRecord, now: MonotonicNs) -> bool {
+    record.taken_over_at.0 != 0 && now.since(record.taken_over_at) <= IN_A_ROW_MS * 1_000_000
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(ms: u64) -> MonotonicNs {
+        MonotonicNs(0).plus_ms(ms)
+    }
+
+    #[test]
+    fn a_stopped_process_is_not_killed_soon_after_a_take_over() {
+        assert!(may_fence(MonotonicNs(0), at(1)));
+        assert!(!may_fence(at(1), at(1_500)));
+        assert!(may_fence(at(1), at(1_501)));
+    }
+
+    #[test]
+    fn five_take_overs_each_within_a_minute_are_a_storm_until_a_minute_has_passed() {
+        use TakeOverCause::{Ended, HandedOver, Stopped};
+
+        let mut record = StandbyRecord::default();
+        let mut take_over = |cause, ms| {
+            let in_a_row = take_overs_in_a_row(&record, cause, at(ms));
+            record = StandbyRecord { taken_over_at: at(ms), in_a_row, ..record };
+            record
+        };
+        assert_eq!(take_over(HandedOver, 1).in_a_row, 0);
+        for number in 1..=4 {
+            let record = take_over(if number % 2 == 0 { Ended } else { Stopped }, number * 60_000);
+            assert_eq!(record.in_a_row, number);
+            assert!(!is_take_over_storm(&record, record.taken_over_at));
+        }
+        assert!(!is_take_over_storm(&take_over(HandedOver, 270_000), at(270_000)));
+        let fifth = take_over(Ended, 330_000);
+        assert_eq!(fifth.in_a_row, 5);
+        assert!(is_take_over_storm(&fifth, at(390_000)) && !is_take_over_storm(&fifth, at(390_001)));
+        assert_eq!(take_over(Ended, 390_001).in_a_row, 1);
+    }
+}
