@@ -220,6 +220,8 @@ enum DiscoveryTimerEvent {
   FollowInterfaces,
   // Those that are left of `unconfirmed`.
   DropUnconfirmed,
+  // For the announcements of those of `unconfirmed` and `dropped`.
+  AskAgain,
   ParticipantCleanup,
   TopicCleanup,
   PublishParticipantMessage,
@@ -289,6 +291,10 @@ pub(crate) struct Discovery {
   pub(crate) known: Vec<Known>,
   // The readers of those that have not been announced to this one.
   unconfirmed: BTreeSet<GUID>,
+  // Those of which no announcement came in time.
+  dropped: BTreeSet<GUID>,
+  // Until when it asks for their announcements.
+  ask_until: std::time::Instant,
   // Participants whose lease has ended lately, and when it did.
   silent: Vec<(GuidPrefix, std::time::Instant)>,
 
@@ -383,6 +389,12 @@ impl Discovery {
   // How long the readers of a journal are believed without an announcement. All are asked for
   // theirs at the start, and some answer only with their next HEARTBEAT, 3 s later.
   const CONFIRM_WITHIN: StdDuration = StdDuration::from_secs(10);
+  // An answer, or the question, may be lost, and Fast DDS and Cyclone DDS repeat nothing that a
+  // reader of the former process has acknowledged.
+  const ASK_PERIOD: StdDuration = StdDuration::from_secs(1);
+  // The lease of Fast DDS is 20 s, that of Cyclone DDS 10 s. A participant that comes back after
+  // its lease is new, and announces all.
+  const ASK_FOR: StdDuration = StdDuration::from_secs(30);
   const CHECK_PARTICIPANT_MESSAGES: StdDuration = StdDuration::from_secs(1);
   #[cfg(feature = "security")]
   const CACHED_SECURE_DISCOVERY_MESSAGE_RESEND_PERIOD: StdDuration = StdDuration::from_secs(1);
@@ -779,6 +791,8 @@ impl Discovery {
       unanswered: Vec::new(),
       known: Vec::new(),
       unconfirmed: BTreeSet::new(),
+      dropped: BTreeSet::new(),
+      ask_until: std::time::Instant::now(),
       silent: Vec::new(),
       // Not as the participant has them: what has changed since is followed then.
       interfaces: Vec::new(),
@@ -987,6 +1001,7 @@ impl Discovery {
                 }
                 DiscoveryTimerEvent::FollowInterfaces => self.follow_interfaces(),
                 DiscoveryTimerEvent::DropUnconfirmed => self.drop_unconfirmed(),
+                DiscoveryTimerEvent::AskAgain => self.ask_again(),
                 DiscoveryTimerEvent::AnswerParticipants => {
                   let Some(dp) = self.domain_participant.clone().upgrade() else {
                     error!("DomainParticipant doesn't exist anymore, exiting Discovery.");
@@ -1333,6 +1348,13 @@ impl Discovery {
       }
     };
 
+    if was_new {
+      // It sends all its announcements again. What is left of it in the attic may be less.
+      self.dcps_topic.reader.forget_writers_of(guid_prefix);
+      self.dcps_subscription.reader.forget_writers_of(guid_prefix);
+      self.dcps_publication.reader.forget_writers_of(guid_prefix);
+    }
+
     // Send notification to dp_event_loop. It will update local reader/writer
     // proxies as the SpdpDiscoveredParticipantData contains a bitmap of the
     // available built-in endpoints.
@@ -1443,14 +1465,41 @@ impl Discovery {
         .discovery_timer
         .borrow_mut()
         .set_timeout(Self::CONFIRM_WITHIN, DiscoveryTimerEvent::DropUnconfirmed);
+      self.ask_until = std::time::Instant::now() + Self::ASK_FOR;
+      self
+        .discovery_timer
+        .borrow_mut()
+        .set_timeout(Self::ASK_PERIOD, DiscoveryTimerEvent::AskAgain);
     }
   }
 
+  fn ask_again(&mut self) {
+    let waits_for = self.unconfirmed.union(&self.dropped);
+    let participants: BTreeSet<GuidPrefix> = waits_for.map(|endpoint| endpoint.prefix).collect();
+    if participants.is_empty() || std::time::Instant::now() >= self.ask_until {
+      self.dropped.clear();
+      return;
+    }
+    for guid_prefix in participants {
+      self.send_discovery_notification(DiscoveryNotificationType::AskAgain { guid_prefix });
+    }
+    self
+      .discovery_timer
+      .borrow_mut()
+      .set_timeout(Self::ASK_PERIOD, DiscoveryTimerEvent::AskAgain);
+  }
+
+  fn confirm(&mut self, endpoint: &GUID) {
+    self.unconfirmed.remove(endpoint);
+    self.dropped.remove(endpoint);
+  }
+
   // Endpoints that ended while there was no process to hear of it. One that is there all the
-  // same, behind a link that is down, is matched when its announcement comes: the built-in
-  // readers ask for that until they have it.
+  // same, behind a link that is down, is matched when its announcement comes, for which
+  // `ask_again` goes on asking.
   fn drop_unconfirmed(&mut self) {
     for endpoint in std::mem::take(&mut self.unconfirmed) {
+      self.dropped.insert(endpoint);
       let db = discovery_db_read(&self.discovery_db);
       let is_reader = db.get_topic_reader(&endpoint).is_some();
       let is_writer = db.get_topic_writer(&endpoint).is_some();
@@ -1482,6 +1531,15 @@ impl Discovery {
   }
 
   fn process_participant_dispose(&mut self, participant_guidp: GuidPrefix) {
+    // What it announced before it left: read afterwards, it would stay for ever.
+    if discovery_db_read(&self.discovery_db)
+      .find_participant_proxy(participant_guidp)
+      .is_some()
+    {
+      self.sedp_receive_topic_data(None);
+      self.sedp_receive_subscription(None);
+      self.sedp_receive_publication(None);
+    }
     // Anybody can dispose any GUID, so the event loop hears only of those that are known.
     if discovery_db_write(&self.discovery_db).remove_participant(participant_guidp, true) {
       self.participant_is_gone(participant_guidp);
@@ -1618,7 +1676,7 @@ impl Discovery {
         match d {
           Sample::Value(d) => {
             trace!("sedp_receive_subscription - {d:?}");
-            self.unconfirmed.remove(&d.reader_proxy.remote_reader_guid);
+            self.confirm(&d.reader_proxy.remote_reader_guid);
             let Some(drd) = discovery_db_write(&self.discovery_db).update_subscription(&d) else {
               continue;
             };
@@ -1693,7 +1751,7 @@ impl Discovery {
         match d {
           Sample::Value(dwd) => {
             trace!("sedp_receive_publication discovered {:?}", dwd);
-            self.unconfirmed.remove(&dwd.writer_proxy.remote_writer_guid);
+            self.confirm(&dwd.writer_proxy.remote_writer_guid);
             let update = discovery_db_write(&self.discovery_db).update_publication(&dwd);
             let Some(discovered_writer_data) = update else {
               continue;
@@ -2605,7 +2663,7 @@ mod tests {
     discovery::sedp_messages::{Endpoint_GUID, TopicBuiltinTopicData},
     messages::submessages::{
       submessage_flag::DATA_Flags,
-      submessages::{InterpreterSubmessage, WriterSubmessage},
+      submessages::{InterpreterSubmessage, ReaderSubmessage, WriterSubmessage},
     },
     network::{constant::*, udp_listener::UDPListener, udp_sender::UDPSender},
     rtps::submessage::*,
@@ -2664,6 +2722,20 @@ mod tests {
     of: GuidPrefix,
     until: std::time::Instant,
   ) -> bool {
+    receives(socket, of, until, |submessage| {
+      matches!(submessage, SubmessageBody::Writer(WriterSubmessage::Data(data, flags))
+        if data.writer_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER
+          && flags.contains(DATA_Flags::Data))
+    })
+  }
+
+  // Whether such a submessage of a participant is among what arrives until `until`.
+  fn receives(
+    socket: &std::net::UdpSocket,
+    of: GuidPrefix,
+    until: std::time::Instant,
+    is_wanted: impl Fn(&SubmessageBody) -> bool,
+  ) -> bool {
     let mut buffer = [0; 4096];
     loop {
       let left = until.saturating_duration_since(std::time::Instant::now());
@@ -2676,14 +2748,40 @@ mod tests {
       };
       let datagram = bytes::Bytes::copy_from_slice(&buffer[..length]);
       let message = crate::rtps::Message::read_from_buffer(&datagram).unwrap();
-      let is_announcement = |submessage: &crate::rtps::Submessage| {
-        matches!(&submessage.body, SubmessageBody::Writer(WriterSubmessage::Data(data, flags))
-          if data.writer_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER
-            && flags.contains(DATA_Flags::Data))
-      };
-      if message.header.guid_prefix == of && message.submessages.iter().any(is_announcement) {
+      let is_of = message.header.guid_prefix == of;
+      if is_of && message.submessages.iter().any(|submessage| is_wanted(&submessage.body)) {
         return true;
       }
+    }
+  }
+
+  // A peer repeats nothing that a reader of the former process has acknowledged.
+  #[test]
+  #[cfg(not(feature = "security"))]
+  fn what_a_journal_has_is_asked_for_until_it_is_announced() {
+    use crate::discovery::{
+      discovery_db::tests::{new_participant, new_reader},
+      journal::{append, PARTICIPANT, READER},
+    };
+
+    let peer = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    let mut known = new_participant();
+    known.metatraffic_unicast_locators = vec![Locator::from(peer.local_addr().unwrap())];
+    known.metatraffic_multicast_locators.clear();
+    let mut journal = Vec::new();
+    append(&mut journal, PARTICIPANT, &known);
+    append(&mut journal, READER, &new_reader(known.participant_guid, 1, "t"));
+    let participant = crate::DomainParticipantBuilder::new(test_domain_id(51))
+      .with_discovery_journal(journal)
+      .build()
+      .unwrap();
+    for question in 1..=3 {
+      let in_20_s = std::time::Instant::now() + StdDuration::from_secs(20);
+      let is_asked = receives(&peer, participant.guid().prefix, in_20_s, |submessage| {
+        matches!(submessage, SubmessageBody::Reader(ReaderSubmessage::AckNack(question, _))
+          if question.writer_id == EntityId::SEDP_BUILTIN_SUBSCRIPTIONS_WRITER)
+      });
+      assert!(is_asked, "question {question}");
     }
   }
 

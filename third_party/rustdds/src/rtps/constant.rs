@@ -627,6 +627,10 @@ pub(crate) enum DiscoveryNotificationType {
   ParticipantForgotten {
     guid_prefix: GuidPrefix,
   },
+  /// What it has announced of its endpoints may not have arrived.
+  AskAgain {
+    guid_prefix: GuidPrefix,
+  },
   AssertTopicLiveliness {
     writer_guid: GUID,
     manual_assertion: bool,

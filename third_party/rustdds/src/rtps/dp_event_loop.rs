@@ -596,6 +596,16 @@ impl DPEventLoop {
           is_silent,
         } => self.remote_participant_lost(guid_prefix, is_silent),
         ParticipantForgotten { guid_prefix } => self.forget_silent_participant(guid_prefix),
+        AskAgain { guid_prefix } => {
+          for reader in [
+            EntityId::SEDP_BUILTIN_SUBSCRIPTIONS_READER,
+            EntityId::SEDP_BUILTIN_PUBLICATIONS_READER,
+          ] {
+            if let Some(reader) = self.message_receiver.reader_mut(reader) {
+              reader.ask_again(guid_prefix);
+            }
+          }
+        }
         InterfacesChanged { interfaces } => self.follow_interfaces(interfaces),
         AssertTopicLiveliness {
           writer_guid,

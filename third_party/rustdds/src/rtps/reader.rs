@@ -599,7 +599,7 @@ impl Reader {
       op.update_contents(proxy);
       0
     } else {
-      proxy.numbers = Arc::clone(&self.numbers);
+      proxy.count_on(Arc::clone(&self.numbers));
       self.matched_writers.insert(proxy.remote_writer_guid, proxy);
       1
     }
@@ -747,7 +747,7 @@ impl Reader {
       match self.matched_writer(writer_guid) {
         Some(writer_proxy) if !writer_proxy.should_ignore_change(seq_num) => {}
         Some(_) => return,
-        None if self.ignores_unmatched(writer_guid) => return,
+        None if writer_guid.entity_id.entity_kind.is_user_defined() => return,
         None => {}
       }
     }
@@ -892,15 +892,6 @@ impl Reader {
 
   // common parts of processing DATA or a completed DATAFRAG (when all frags are
   // received)
-  // What a Reliable Reader receives from a Writer that it has not matched is not acknowledged, and
-  // no DataReader gets it: the Writer sends it again once they match. The announcements of
-  // a participant's endpoints come before they match, and the last disposes after the
-  // participant has said goodbye.
-  fn ignores_unmatched(&self, writer: GUID) -> bool {
-    writer.entity_id.entity_kind.is_user_defined()
-      || self.reliability != policy::Reliability::BestEffort
-  }
-
   fn process_received_data(
     &mut self,
     dds_data: DDSData,
@@ -942,8 +933,8 @@ impl Reader {
         );
         // This is normal if the DATA was broadcast, but it was from another topic.
         // We just ignore the data in such a case
-        // ... unless it announces a participant.
-        if self.ignores_unmatched(writer_guid) {
+        // ... unless it is Discovery traffic.
+        if writer_guid.entity_id.entity_kind.is_user_defined() {
           return;
         }
       }
@@ -1622,6 +1613,15 @@ impl Reader {
     self.matched_writers = writer_proxies;
   }
 
+  // Asks the Writers of a participant for a HEARTBEAT once more.
+  pub fn ask_again(&mut self, participant: GuidPrefix) {
+    let mut writer_proxies = std::mem::take(&mut self.matched_writers);
+    for (_, writer_proxy) in writer_proxies.range_mut(participant.range()) {
+      self.send_preemptive_acknack_to(writer_proxy);
+    }
+    self.matched_writers = writer_proxies;
+  }
+
   // An ACKNACK without the final flag requests an immediate HEARTBEAT from the
   // writer.
   fn send_preemptive_acknack_to(&self, writer_proxy: &mut RtpsWriterProxy) {
@@ -2017,73 +2017,6 @@ mod tests {
     add(&mut reader, 4, &best_effort_qos);
     let matched = |number| reader.matched_writer(writer(number)).is_some();
     assert_eq!([1, 2, 3, 4].map(matched), [true, true, false, true]);
-  }
-
-  // The disposes of a participant's endpoints arrive after its goodbye, and announcements can be forged.
-  #[test]
-  fn reader_of_discovery_keeps_reliable_data_of_matched_writers_only() {
-    let reliable = QosPolicyBuilder::new().reliable(Duration::from_millis(100)).build();
-    let best_effort = QosPolicyBuilder::new().best_effort().build();
-    for (qos, kept_unmatched) in [(reliable, 0), (best_effort, 1)] {
-      let topic_cache_handle = DDSCache::new().add_new_topic(
-        "test_name".to_string(),
-        TypeDesc::new("test_type".to_string()),
-        &qos,
-      );
-      let (notification_sender, _notifications) = crate::mio_source::notification_channel(100);
-      let (_event_source, poll_event_sender) = mio_source::make_poll_channel().unwrap();
-      let (status_sender, _statuses) = sync_status_channel::<DataReaderStatus>(4).unwrap();
-      let (participant_status_sender, _participant_statuses) = sync_status_channel(16).unwrap();
-      let (_commands, data_reader_command_receiver) =
-        wake_channel::<ReaderCommand>(4, &LoopWaker::new());
-      let mut reader = Reader::new(
-        ReaderIngredients {
-          guid: GUID::dummy_test_guid(EntityKind::READER_WITH_KEY_BUILT_IN),
-          notification_sender,
-          status_sender,
-          topic_name: "test_name".to_string(),
-          topic_cache_handle: topic_cache_handle.clone(),
-          like_stateless: false,
-          qos_policy: qos.clone(),
-          data_reader_command_receiver,
-          data_reader_waker: Arc::new(Mutex::new(None)),
-          poll_event_sender,
-          security_plugins: None,
-          discovery_notify: None,
-        },
-        Rc::new(UDPSender::new(0).unwrap()),
-        new_shared_timer(),
-        participant_status_sender,
-      );
-      let writer = GUID::dummy_test_guid(EntityKind::WRITER_WITH_KEY_BUILT_IN);
-      let mr_state = MessageReceiverState {
-        source_guid_prefix: writer.prefix,
-        ..Default::default()
-      };
-      let data = Data {
-        writer_id: writer.entity_id,
-        ..Data::default()
-      };
-      let fragment = DataFrag {
-        writer_id: writer.entity_id,
-        writer_sn: SequenceNumber::new(2),
-        fragment_starting_num: FragmentNumber::new(1),
-        fragments_in_submessage: 1,
-        data_size: 8,
-        fragment_size: 8,
-        serialized_payload: bytes::Bytes::from_static(&[0; 8]),
-        ..DataFrag::default()
-      };
-      let kept_after_both = |reader: &mut Reader| {
-        let flags = BitFlags::<DATA_Flags>::from_flag(DATA_Flags::Data);
-        reader.handle_data_msg(data.clone(), flags, &mr_state);
-        reader.handle_datafrag_msg(&fragment, BitFlags::empty(), &mr_state);
-        topic_cache_handle.lock().unwrap().sample_count()
-      };
-      assert_eq!(kept_after_both(&mut reader), 2 * kept_unmatched, "{qos:?}");
-      reader.matched_writer_add(writer, EntityId::UNKNOWN, vec![], vec![], &qos);
-      assert_eq!(kept_after_both(&mut reader), 2, "{qos:?}");
-    }
   }
 
   #[test]

@@ -106,9 +106,17 @@ impl RtpsWriterProxy {
     }
   }
 
+  // Counts above all that the participant has used: the Writer may know those of a former
+  // match, and discards what is not above them.
+  pub fn count_on(&mut self, numbers: Arc<UsedNumbers>) {
+    self.sent_ack_nack_count = numbers.highest_count();
+    self.numbers = numbers;
+  }
+
   pub fn next_ack_nack_sequence_number(&mut self) -> i32 {
-    // The first is 1: Fast DDS has counted 0 before anything came, and discards it.
-    self.sent_ack_nack_count = self.sent_ack_nack_count.max(self.numbers.count_before()) + 1;
+    // The first is 1: Fast DDS has counted 0 before anything came, and discards it. After 2^31 it
+    // wraps, as the counts of Fast DDS do.
+    self.sent_ack_nack_count = self.sent_ack_nack_count.wrapping_add(1);
     self.numbers.use_count(self.sent_ack_nack_count);
     self.sent_ack_nack_count
   }
@@ -454,10 +462,14 @@ mod bounded_map_tests {
     };
     let mut proxy = test_proxy();
     assert_eq!(proxy.next_ack_nack_sequence_number(), 1);
-    proxy.numbers = Arc::new(UsedNumbers::after(&identity));
+    proxy.count_on(Arc::new(UsedNumbers::after(&identity)));
     assert_eq!(proxy.next_ack_nack_sequence_number(), 501);
     assert_eq!(proxy.next_ack_nack_sequence_number(), 502);
     assert_eq!(proxy.numbers.highest_count(), 502);
+    // As when the writer is matched again.
+    let mut again = test_proxy();
+    again.count_on(Arc::clone(&proxy.numbers));
+    assert_eq!(again.next_ack_nack_sequence_number(), 503);
   }
 
   // Regression: a best-effort writer sends no HEARTBEAT/GAP, so the changes map

@@ -20,11 +20,17 @@ use crate::{
     typedesc::TypeDesc,
     CreateError, CreateResult,
   },
-  rtps::constant::{MAX_KEPT_BYTES_PER_BUILTIN_TOPIC, MAX_WITHHELD_BYTES_PER_TOPIC},
-  structure::{sequence_number::SequenceNumber, time::Timestamp},
+  rtps::constant::{
+    builtin_topic_names::DCPS_PARTICIPANT, MAX_KEPT_BYTES_PER_BUILTIN_TOPIC,
+    MAX_WITHHELD_BYTES_PER_TOPIC,
+  },
+  structure::{duration::Duration, sequence_number::SequenceNumber, time::Timestamp},
   GUID,
 };
 use super::cache_change::CacheChange;
+
+// How long discovery data of a Writer that is not matched is kept.
+const KEEP_UNMATCHED: Duration = Duration::from_secs(5);
 
 /// DDSCache contains all cacheChanges that are
 /// received by this participant. It is for serving local Readers. Local
@@ -99,8 +105,10 @@ impl DDSCache {
   }
 
   pub fn garbage_collect(&mut self) {
+    let unmatched_before = Timestamp::now() - KEEP_UNMATCHED;
     for tc in self.topic_caches.values_mut() {
       let mut tc = tc.lock().unwrap();
+      tc.forget_unmatched_writers(unmatched_before);
       if let Some((last_timestamp, _)) = tc.changes.iter().next_back() {
         if *last_timestamp > tc.changes_reallocated_up_to {
           tc.remove_changes_before(Timestamp::ZERO);
@@ -294,6 +302,27 @@ impl TopicCache {
     {
       self.changes.remove(instant);
     }
+  }
+
+  // Discovery data may come before its Writer is matched, which makes discovery faster. If the
+  // Writer is not matched then, or was before, as with the disposes of a participant that
+  // has said goodbye, no Reliable DataReader gets the data.
+  fn forget_unmatched_writers(&mut self, before: Timestamp) {
+    // Of participants, a Best-Effort DataReader reads the announcements of all.
+    if !self.is_built_in || self.topic_name == DCPS_PARTICIPANT {
+      return;
+    }
+    let (matched, changes) = (&self.received_reliably_before, &mut self.changes);
+    self.sequence_numbers.retain(|writer, instants| {
+      let is_kept =
+        matched.contains_key(writer) || instants.values().any(|instant| *instant >= before);
+      if !is_kept {
+        for instant in instants.values() {
+          changes.remove(instant);
+        }
+      }
+      is_kept
+    });
   }
 
   // The oldest change that a Reliable DataReader cannot yet take, because an
@@ -657,11 +686,6 @@ impl TopicCache {
   }
 
   #[cfg(test)]
-  pub(crate) fn sample_count(&self) -> usize {
-    self.changes.len()
-  }
-
-  #[cfg(test)]
   pub(crate) fn max_keep_samples(&self) -> i32 {
     self.max_keep_samples
   }
@@ -798,6 +822,40 @@ mod tests {
       read_after_repair(&Discovery::builtin_sedp_reader_qos()),
       [SequenceNumber::new(1), SequenceNumber::new(2)]
     );
+  }
+
+  // Announcements may come before their Writer is matched. Disposes of a participant's endpoints
+  // come after its goodbye, and anything can be forged.
+  #[test]
+  fn discovery_data_of_unmatched_writers_is_kept_for_a_moment() {
+    let writer = |prefix| {
+      GUID::new(GuidPrefix::new(&[prefix; 12]), EntityId::SEDP_BUILTIN_PUBLICATIONS_WRITER)
+    };
+    let [matched, unmatched] = [1, 2].map(writer);
+    for (topic, is_forgotten) in [("DCPSPublication", true), ("DCPSParticipant", false)] {
+      let mut topic_cache = TopicCache::new(
+        topic.to_string(),
+        TypeDesc::new("test".to_string()),
+        &Discovery::builtin_sedp_reader_qos(),
+      );
+      let received = Timestamp::now();
+      for writer in [matched, unmatched] {
+        let sample = CacheChange::new(
+          writer,
+          SequenceNumber::new(1),
+          WriteOptions::default(),
+          DDSData::new(SerializedPayload::default()),
+        );
+        topic_cache.add_change(&received, sample);
+      }
+      topic_cache.mark_reliably_received_before(matched, SequenceNumber::new(2));
+      topic_cache.forget_unmatched_writers(received);
+      assert_eq!(topic_cache.changes.len(), 2, "{topic}");
+      topic_cache.forget_unmatched_writers(Timestamp::now() + Duration::from_secs(1));
+      assert!(topic_cache.has_writer(matched), "{topic}");
+      assert_eq!(topic_cache.has_writer(unmatched), !is_forgotten, "{topic}");
+      assert_eq!(topic_cache.changes.len(), if is_forgotten { 1 } else { 2 }, "{topic}");
+    }
   }
 
   // A new Reader must not get what a former one has received, nor lose what comes

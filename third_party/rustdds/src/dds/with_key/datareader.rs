@@ -23,7 +23,12 @@ use crate::{
   },
   discovery::sedp_messages::PublicationBuiltinTopicData,
   serialization::CDRDeserializerAdapter,
-  structure::{duration::Duration, entity::RTPSEntity, guid::GUID, time::Timestamp},
+  structure::{
+    duration::Duration,
+    entity::RTPSEntity,
+    guid::{GuidPrefix, GUID},
+    time::Timestamp,
+  },
 };
 
 /// Simplified type for CDR encoding
@@ -104,6 +109,11 @@ where
         .fill_from_deserialized_cache_change(dcc);
     }
     Ok(())
+  }
+
+  /// Reads again what the Writers of the participant send again, as a new participant's.
+  pub(crate) fn forget_writers_of(&self, participant: GuidPrefix) {
+    self.simple_data_reader.forget_writers_of(participant);
   }
 
   fn drain_read_notifications(&self) {
@@ -1194,7 +1204,7 @@ mod tests {
     },
     serialization::to_vec,
     structure::{
-      guid::{EntityId, EntityKind, GuidPrefix},
+      guid::{EntityId, EntityKind},
       sequence_number::SequenceNumber,
     },
     test::{random_data::*, test_domain::test_domain_id},

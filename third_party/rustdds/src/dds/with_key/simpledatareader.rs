@@ -42,7 +42,7 @@ use crate::{
     cache_change::CacheChange,
     dds_cache::TopicCache,
     entity::RTPSEntity,
-    guid::{EntityId, GUID},
+    guid::{EntityId, GuidPrefix, GUID},
     sequence_number::SequenceNumber,
     time::Timestamp,
   },
@@ -91,6 +91,10 @@ impl<K: Key> ReadState<K> {
       ..
     } = self;
     (last_read_sn, known_keys)
+  }
+
+  fn forget_writers_of(&mut self, participant: GuidPrefix) {
+    self.last_read_sn.retain(|writer, _| writer.prefix != participant);
   }
 
   // Moves the read pointer of a Writer for RELIABLE reading.
@@ -268,6 +272,11 @@ where
 
   pub(crate) fn set_waker(&self, w: Option<Waker>) {
     *self.data_reader_waker.lock().unwrap() = w;
+  }
+
+  /// Reads again what the Writers of the participant send again, as a new participant's.
+  pub(crate) fn forget_writers_of(&self, participant: GuidPrefix) {
+    self.read_state.lock().unwrap().forget_writers_of(participant);
   }
 
   pub(crate) fn drain_read_notifications(&self) {
@@ -837,7 +846,7 @@ mod tests {
   use crate::{
     dds::typedesc::TypeDesc,
     messages::submessages::elements::serialized_payload::SerializedPayload,
-    structure::guid::GuidPrefix, with_key::WriteOptions,
+    with_key::WriteOptions,
   };
 
   fn writer(number: usize) -> GUID {
@@ -879,6 +888,14 @@ mod tests {
     assert!(state.last_read_sn.len() <= MAX_FORMER_WRITERS);
     // The one that is still there.
     assert!(state.last_read_sn.contains_key(&writer(0)));
+  }
+
+  #[test]
+  fn a_participant_that_is_new_again_is_read_again() {
+    let mut state = read_of_many(3, false);
+    state.forget_writers_of(writer(1).prefix);
+    let read = [0, 1, 2].map(|number| state.last_read_sn.contains_key(&writer(number)));
+    assert_eq!(read, [true, false, true]);
   }
 
   #[test]
