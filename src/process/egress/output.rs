@@ -4,6 +4,7 @@ mod announce;
 mod catch_up;
 mod former;
 mod matching;
+mod missing;
 
 use std::collections::VecDeque;
 
@@ -29,7 +30,7 @@ use crate::config::{self, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter};
 use crate::model::{
     DdsType, DropReason, Durability, Guid, LaneCounters, LaneMode, MonotonicNs, OutputReaders, PartialSample,
-    SampleHeader, TrafficClass, TypeHash, UnmatchedPolicy,
+    TrafficClass, TypeHash, UnmatchedPolicy,
 };
 use crate::policy::{CatchUp, SequenceOutcome, SequenceTracker, critical_drop};
 use crate::shm::{
@@ -101,6 +102,8 @@ pub(super) struct Output {
     caught_up: bool,
     /// Starts of ingress at the last housekeeping.
     ingress_starts: u64,
+    /// When ingress was started again, until a sample of the new process is taken.
+    ingress_restarted_at: Option<MonotonicNs>,
     shm: HistogramWriter,
     dds_out: HistogramWriter,
     age: HistogramWriter,
@@ -135,6 +138,12 @@ impl Output {
             true,
         )?;
         let latched_offer = output.latched_qos.map(|qos| Offer::of(lane, qos));
+        let catch_up = match lane.class() {
+            TrafficClass::Critical => {
+                CatchUp::of_critical(offer.window_samples, readers.get().iter(), started_at)
+            }
+            TrafficClass::Noncritical => CatchUp::never(),
+        };
         let mut opened = Self {
             id: route.id.to_string(),
             lane: lane.name.to_string(),
@@ -168,10 +177,7 @@ impl Output {
             record,
             former: Some(Box::new(former_samples)),
             next: VecDeque::new(),
-            catch_up: match lane.class() {
-                TrafficClass::Critical => CatchUp::of_critical(offer.window_samples, started_at),
-                TrafficClass::Noncritical => CatchUp::never(),
-            },
+            catch_up,
             taken_in_a_row: 0,
             is_paced: false,
             last_publisher: Guid::default(),
@@ -179,6 +185,7 @@ impl Output {
             started_at,
             caught_up: false,
             ingress_starts: boards.health(ProcessRole::Ingress).map_or(0, |health| health.starts),
+            ingress_restarted_at: None,
             shm: boards.histogram_writer(Stage::Shm(lane_index), output.route),
             dds_out: boards.histogram_writer(Stage::DdsOut(lane_index), output.route),
             age: boards.histogram_writer(Stage::Age(lane_index), output.route),
@@ -249,9 +256,7 @@ impl Output {
                     continue;
                 }
             }
-            if sample.header().published_at >= self.started_at {
-                self.caught_up = true;
-            }
+            self.follow_restarts(sample.header());
             if self.is_too_old(sample.header()) {
                 let reason = if self.caught_up { self.gap_reason } else { DropReason::LaneDown };
                 self.drop_sample(&sample, reason);
@@ -378,7 +383,7 @@ impl Output {
         } else {
             writer.write_from(publisher, payload, encapsulation, timestamp, header.key)
         };
-        self.catch_up.wrote(1);
+        self.catch_up.wrote(bytes as u64);
         let complete = self.former_readers.is_empty();
         let done_at = clock::monotonic();
         let forwarded = Forwarded {
@@ -524,6 +529,7 @@ impl Output {
             && health.starts != self.ingress_starts
         {
             self.ingress_starts = health.starts;
+            self.ingress_restarted_at = Some(health.started_at);
             self.withdraw_early();
             self.early.forget_pool();
         }
@@ -547,28 +553,6 @@ impl Output {
         if let Some(info) = self.boards.route_info(self.route) {
             self.durability.set(info.durability());
         }
-    }
-
-    /// Counts the samples missing before `next`, by the reason why the lane did not get them.
-    fn count_missing(&mut self, missing: u64, next: &SampleHeader) {
-        let restarted = self.boards.health(ProcessRole::Ingress).is_some_and(|health| {
-            health.starts != self.ingress_starts && next.published_at >= health.started_at
-        });
-        let reason = if !self.caught_up && self.tracker.first() > 0 && next.published_at < self.started_at {
-            DropReason::LaneDown
-        } else if restarted {
-            DropReason::IngressDied
-        } else if !self.caught_up {
-            DropReason::LaneDown
-        } else {
-            self.gap_reason
-        };
-        self.counters.update(|counters| {
-            counters.first_sequence = self.tracker.first();
-            // This accounts for the missing samples, but not yet for `next`.
-            counters.last_sequence = next.sequence - 1;
-            counters.drops.add(reason, missing);
-        });
     }
 
     /// Writes a sample that was forwarded before a restart again, for late joiners.

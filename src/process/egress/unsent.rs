@@ -13,22 +13,29 @@ use crate::policy::SequenceTracker;
 pub(super) struct UnsentSamples {
     samples: VecDeque<Forwarded>,
     capacity: usize,
+    bytes: u64,
 }
 
 impl UnsentSamples {
     /// Room for as many samples as the writer's history holds.
     pub fn new(history_samples: usize) -> Self {
         let capacity = history_samples.max(1);
-        Self { samples: VecDeque::with_capacity(capacity), capacity }
+        Self { samples: VecDeque::with_capacity(capacity), capacity, bytes: 0 }
     }
 
     pub fn len(&self) -> usize {
         self.samples.len()
     }
 
+    /// The bytes of all of them together.
+    pub const fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
     /// Adds a sample, and returns the oldest one if the history has no room for both: it was evicted unsent.
     pub fn push(&mut self, sample: Forwarded) -> Option<Forwarded> {
-        let evicted = if self.samples.len() == self.capacity { self.samples.pop_front() } else { None };
+        let evicted = if self.samples.len() == self.capacity { self.pop() } else { None };
+        self.bytes += sample.bytes;
         self.samples.push_back(sample);
         evicted
     }
@@ -38,13 +45,20 @@ impl UnsentSamples {
         if self.samples.front()?.number > sent_through {
             return None;
         }
-        self.samples.pop_front()
+        self.pop()
+    }
+
+    fn pop(&mut self) -> Option<Forwarded> {
+        let oldest = self.samples.pop_front();
+        self.bytes -= oldest.map_or(0, |sample| sample.bytes);
+        oldest
     }
 
     /// Removes all samples and returns their number.
     pub fn clear(&mut self) -> usize {
         let unsent = self.samples.len();
         self.samples.clear();
+        self.bytes = 0;
         unsent
     }
 }
@@ -94,8 +108,8 @@ mod tests {
         assert_eq!(numbers((3..=5).map(|number| samples.push(unsent(number)))), [None, None, None]);
         let sent = [2, 4, 4, 4].map(|sent_through| samples.pop_sent(sent_through));
         assert_eq!(numbers(sent), [None, Some(3), Some(4), None]);
-        assert_eq!(samples.len(), 1);
-        assert_eq!(samples.clear(), 1);
+        assert_eq!((samples.len(), samples.bytes()), (1, 7));
+        assert_eq!((samples.clear(), samples.bytes()), (1, 0));
         assert!(samples.pop_sent(i64::MAX).is_none());
     }
 
@@ -103,6 +117,6 @@ mod tests {
     fn a_full_history_evicts_the_oldest() {
         let mut samples = UnsentSamples::new(2);
         assert_eq!(numbers((1..=3).map(|number| samples.push(unsent(number)))), [None, None, Some(1)]);
-        assert_eq!(samples.len(), 2);
+        assert_eq!((samples.len(), samples.bytes()), (2, 14));
     }
 }

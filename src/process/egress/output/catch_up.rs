@@ -44,9 +44,14 @@ impl Output {
     /// that catches up also waits until the readers have acknowledged them: all of them at once would
     /// overflow the sockets of the readers, and leave the history of the writer before they are repaired.
     pub(super) fn is_to_be_paced(&mut self) -> bool {
-        self.is_paced =
-            self.unsent.len() as u64 >= self.catch_up.most_unacknowledged() || self.waits_for_readers();
+        // The library may have sent them since the last turn, while another output kept the lane busy.
+        self.is_paced = (self.is_library_full() && self.count_sent() && self.is_library_full())
+            || self.waits_for_readers();
         self.is_paced
+    }
+
+    fn is_library_full(&self) -> bool {
+        self.catch_up.is_full(self.unsent.len() as u64, self.unsent.bytes())
     }
 
     fn waits_for_readers(&self) -> bool {

@@ -7,7 +7,8 @@ use super::*;
 use crate::config::DropPolicy;
 use crate::dds::{RawReader, ReaderQos};
 use crate::model::{
-    Encapsulation, FixedText, KeyedPayload, MAX_UNMATCHED_READERS, Reliability, RouteInfo, SampleKey,
+    Encapsulation, FixedText, KeyedPayload, MAX_UNMATCHED_READERS, Reliability, RouteInfo, SampleHeader,
+    SampleKey,
 };
 use crate::process::role::participant_options;
 use crate::process::test_role::{self, SCAN, TYPE, wait_until};
@@ -63,7 +64,13 @@ impl Host {
     }
 
     fn send(&mut self, output: &mut Output) {
-        let sample = output.take().unwrap();
+        // A lane that catches up may wait for acknowledgements.
+        let mut taken = None;
+        wait_until("a sample", || {
+            taken = output.take();
+            taken.is_some()
+        });
+        let sample = taken.unwrap();
         output.send(sample, &mut self.participant, &mut self.arena);
     }
 
@@ -151,19 +158,28 @@ fn missing_samples_have_the_reason_why_the_lane_did_not_get_them() {
         (true, Some(before), after, IngressDied),
         (true, Some(after), started, QueueOverflow),
     ] {
-        host.role.boards.health_writer(ProcessRole::Ingress).update(|health| {
-            health.starts = output.ingress_starts + u64::from(restarted_at.is_some());
-            health.started_at = restarted_at.unwrap_or(before);
-        });
-        output.caught_up = caught_up;
-        output.tracker = SequenceTracker::resume(10, 20);
-        output.counters.update(|counters| *counters = LaneCounters::default());
-        let next = SampleHeader { published_at, ..header(24) };
-        output.count_missing(3, &next);
-        let what = format!("{caught_up} {restarted_at:?} {published_at:?}");
-        assert_eq!((dropped(&output, reason), output.counters.get().drops.total()), (3, 3), "{what}");
-        let counters = output.counters.get();
-        assert_eq!((counters.first_sequence, counters.last_sequence), (10, 23), "{what}");
+        for has_housekeeping in [false, true] {
+            host.role.boards.health_writer(ProcessRole::Ingress).update(|health| {
+                health.starts = output.ingress_starts + u64::from(restarted_at.is_some());
+                health.started_at = restarted_at.unwrap_or(before);
+            });
+            output.ingress_restarted_at = None;
+            if has_housekeeping {
+                output.housekeeping(&mut host.participant, after);
+            }
+            output.caught_up = caught_up;
+            output.tracker = SequenceTracker::resume(10, 20);
+            output.counters.update(|counters| *counters = LaneCounters::default());
+            let next = SampleHeader { published_at, ..header(24) };
+            output.count_missing(3, &next);
+            let what = format!("{caught_up} {restarted_at:?} {published_at:?} {has_housekeeping}");
+            let counters = output.counters.get();
+            assert_eq!((counters.drops.get(reason), counters.drops.total()), (3, 3), "{what}");
+            assert_eq!((counters.first_sequence, counters.last_sequence), (10, 23), "{what}");
+            output.follow_restarts(&next);
+            let is_over = restarted_at.is_none_or(|restarted_at| published_at >= restarted_at);
+            assert_eq!(output.ingress_restarted_at.is_none(), is_over || !has_housekeeping, "{what}");
+        }
     }
 }
 
@@ -566,7 +582,7 @@ fn samples_of_a_critical_lane_wait_for_the_former_readers() {
 fn a_critical_lane_leaves_out_what_is_too_old_to_catch_up_with() {
     let mut host = Host::start(147, CRITICAL, SCAN);
     let mut output = host.open();
-    output.catch_up = CatchUp::of_critical(256, MonotonicNs(0).plus_ms(100_000));
+    output.catch_up = CatchUp::of_critical(256, [], MonotonicNs(0).plus_ms(100_000));
     host.role.boards.ingress_writer(0).update(|ingress| ingress.published = 20);
     let published = |ms| MonotonicNs(0).plus_ms(ms);
     // When the sample was published, its number, the LIFESPAN, and whether it is too old. Each was taken at

@@ -47,6 +47,13 @@ impl DDSData {
       lent: Some(lent),
     }
   }
+  // Whether a DataReader has taken the memory that the sample was put together in.
+  pub(crate) fn is_taken(&self) -> bool {
+    match self {
+      Self::Data { lent: Some(lent), .. } => lent.with(|memory| memory.is_none()),
+      _ => false,
+    }
+  }
   pub fn new_disposed_by_key(change_kind: ChangeKind, key: SerializedPayload) -> Self {
     Self::DisposeByKey {
       change_kind,

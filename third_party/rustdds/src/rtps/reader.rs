@@ -942,6 +942,12 @@ impl Reader {
       // stateless reader: nothing to do before making cache change
     }
 
+    // An earlier sample of a Best-Effort Writer is not repaired, and in vain if it is completed
+    // late. Its memory may be lent.
+    if self.reliability == policy::Reliability::BestEffort {
+      self.fragment_assemblers.discard_before(writer_guid, writer_sn);
+    }
+
     self.make_cache_change(
       dds_data,
       receive_timestamp,
@@ -2017,6 +2023,65 @@ mod tests {
     add(&mut reader, 4, &best_effort_qos);
     let matched = |number| reader.matched_writer(writer(number)).is_some();
     assert_eq!([1, 2, 3, 4].map(matched), [true, true, false, true]);
+  }
+
+  #[test]
+  fn an_unfinished_best_effort_sample_ends_with_the_next_one() {
+    let qos = QosPolicyBuilder::new().best_effort().build();
+    let topic_cache_handle = DDSCache::new().add_new_topic(
+      "test_name".to_string(),
+      TypeDesc::new("test_type".to_string()),
+      &qos,
+    );
+    let (notification_sender, _notifications) = crate::mio_source::notification_channel(100);
+    let (_event_source, poll_event_sender) = mio_source::make_poll_channel().unwrap();
+    let (status_sender, _statuses) = sync_status_channel::<DataReaderStatus>(4).unwrap();
+    let (participant_status_sender, _participant_statuses) = sync_status_channel(16).unwrap();
+    let (_commands, data_reader_command_receiver) =
+      wake_channel::<ReaderCommand>(4, &LoopWaker::new());
+    let mut reader = Reader::new(
+      ReaderIngredients {
+        guid: GUID::dummy_test_guid(EntityKind::READER_NO_KEY_USER_DEFINED),
+        notification_sender,
+        status_sender,
+        topic_name: "test_name".to_string(),
+        topic_cache_handle,
+        like_stateless: false,
+        qos_policy: qos.clone(),
+        data_reader_command_receiver,
+        data_reader_waker: Arc::new(Mutex::new(None)),
+        poll_event_sender,
+        security_plugins: None,
+        discovery_notify: None,
+      },
+      Rc::new(UDPSender::new(0).unwrap()),
+      new_shared_timer(),
+      participant_status_sender,
+    );
+    let writer = GUID::dummy_test_guid(EntityKind::WRITER_NO_KEY_USER_DEFINED);
+    reader.matched_writer_add(writer, EntityId::UNKNOWN, vec![], vec![], &qos);
+    let mr_state = MessageReceiverState {
+      source_guid_prefix: writer.prefix,
+      ..Default::default()
+    };
+    let mut receive = |number, fragment| {
+      let fragment = DataFrag {
+        writer_id: writer.entity_id,
+        writer_sn: SequenceNumber::new(number),
+        fragment_starting_num: FragmentNumber::new(fragment),
+        fragments_in_submessage: 1,
+        data_size: 16,
+        fragment_size: 8,
+        serialized_payload: bytes::Bytes::from_static(&[0; 8]),
+        ..DataFrag::default()
+      };
+      reader.handle_datafrag_msg(&fragment, BitFlags::empty(), &mr_state);
+      reader.fragment_assemblers.own_bytes()
+    };
+    let of_one = receive(1, 1);
+    assert!(of_one > 0);
+    assert_eq!(receive(2, 1), 2 * of_one);
+    assert_eq!(receive(2, 2), 0, "the first one is discarded with the second one");
   }
 
   #[test]

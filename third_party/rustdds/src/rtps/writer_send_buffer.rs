@@ -176,6 +176,13 @@ impl Inner {
     }
   }
 
+  // Two samples stay whatever their size: the one that was just written and the one that
+  // may be half sent.
+  fn is_over_window(&self) -> bool {
+    self.changes.len() > self.window_limit
+      || (self.retained_bytes > KEEP_LAST_MAX_RETAINED_BYTES && self.changes.len() > 2)
+  }
+
   // Of a sample that was removed from `changes`.
   fn release(&mut self, released: CacheChange) {
     self.retained_bytes -= released.data_value.payload_size();
@@ -584,21 +591,25 @@ impl WriterSendBuffer {
     //    KeepLast here keeps only the recent samples (correct for volatile
     //    durability); once a reliable reader matches, `reliable_readers_present`
     //    flips true and we retain everything again for repair.
+    // For a matched reader, what is unsent stays within the window: with a small depth, a burst
+    // would evict samples that the application counts as sent.
     // Built-in (discovery) writers are always exempt to never lose discovery data.
     let trim_keep_last = !shared.is_builtin
       && (!may_block
         || (shared.reliable_writer && shared.volatile && !inner.reliable_readers_present));
     if trim_keep_last {
-      while inner.changes.len() > inner.max_retain && !Self::waits_for_one_reader(shared, inner) {
+      while inner.changes.len() > inner.max_retain
+        && !Self::waits_for_one_reader(shared, inner)
+        && (inner.readers.is_empty()
+          || inner.is_over_window()
+          || Self::is_oldest_sent(shared, inner))
+      {
         inner.evict_oldest();
       }
     } else if shared.keep_last.is_some() {
       // Some reader has not acknowledged the oldest sample for `window_limit`
-      // samples. It alone misses that sample. Two samples stay whatever their size:
-      // the one that was just written and the one that may be half sent.
-      while inner.changes.len() > inner.window_limit
-        || (inner.retained_bytes > KEEP_LAST_MAX_RETAINED_BYTES && inner.changes.len() > 2)
-      {
+      // samples. It alone misses that sample.
+      while inner.is_over_window() {
         inner.evict_oldest();
       }
     }
@@ -681,6 +692,11 @@ impl WriterSendBuffer {
     inner.changes.first_key_value().is_some_and(|(oldest, change)| {
       change.write_options.to_single_reader().is_some() && *oldest > shared.direct_send.last_sent()
     })
+  }
+
+  fn is_oldest_sent(shared: &Shared, inner: &Inner) -> bool {
+    let oldest = inner.changes.first_key_value();
+    oldest.is_none_or(|(oldest, _)| *oldest <= shared.direct_send.last_sent())
   }
 
   /// Sends a freshly admitted sample on the calling thread, if that is possible.
@@ -1351,6 +1367,34 @@ mod tests {
     // Newest is retained, an evicted older one is gone.
     assert!(buf.get_by_sn(last).is_some());
     assert!(buf.get_by_sn(SequenceNumber::new(1)).is_none());
+  }
+
+  #[test]
+  fn what_is_unsent_is_retained_for_a_best_effort_reader() {
+    let buf = WriterSendBuffer::new(
+      GUID::GUID_UNKNOWN,
+      "t".to_string(),
+      /* reliable_writer */ true,
+      /* is_builtin */ false,
+      /* volatile */ true,
+      /* window_limit */ 8,
+      /* backlog_limit */ 1000,
+      /* max_retain */ 2,
+    );
+    let write = |count: usize| (0..count).for_each(|_| assert!(admit_now(&buf, WriteOptions::default())));
+    write(5);
+    assert_eq!(buf.retained_len(), 2, "without a reader");
+    buf.reader_matched(GUID::GUID_UNKNOWN, false, false);
+    write(6);
+    assert_eq!(buf.retained_len(), 8);
+    write(2);
+    assert_eq!(buf.retained_len(), 8, "the window is full");
+    buf.direct_send().set_last_sent(SequenceNumber::new(10));
+    write(1);
+    assert_eq!(buf.first_change_sequence_number(), SequenceNumber::new(11));
+    buf.direct_send().set_last_sent(SequenceNumber::new(14));
+    write(1);
+    assert_eq!(buf.retained_len(), 2);
   }
 
   // The history of a BEST_EFFORT writer is written again to a late joiner: more samples

@@ -43,7 +43,7 @@ fn a_critical_lane_takes_from_the_backlog_what_its_queue_has_lost() {
         assert_eq!(take_all(&mut output), (131..=300).collect::<Vec<_>>(), "after a stall");
         assert_eq!(output.counters.get().drops.total(), 0);
         // A lane that stays behind goes on with its queue.
-        output.catch_up = CatchUp::of_critical(256, MonotonicNs(0));
+        output.catch_up = CatchUp::of_critical(256, [], MonotonicNs(0));
         publish(&host, 301..=400);
         assert_eq!(take_all(&mut output), (337..=400).collect::<Vec<_>>());
         assert_eq!(output.counters.get().drops.total(), 36);
@@ -53,6 +53,7 @@ fn a_critical_lane_takes_from_the_backlog_what_its_queue_has_lost() {
 #[test]
 fn samples_wait_until_the_library_has_sent_those_before() {
     let mut host = Host::start(158, CRITICAL, SCAN);
+    host.announce_type();
     let mut output = host.open();
     output.catch_up.end();
     host.publish_next(1);
@@ -63,6 +64,22 @@ fn samples_wait_until_the_library_has_sent_those_before() {
     output.unsent.pop_sent(1);
     assert_eq!(take_all(&mut output), [1]);
     assert!(!output.is_paced());
+
+    // It has sent them since the last turn, in which another output kept the lane busy.
+    host.publish_next(2);
+    output.unsent.clear();
+    for _ in 0..output.offer.window_samples / 2 {
+        output.unsent.push(unsent(0));
+    }
+    assert_eq!(take_all(&mut output), [2]);
+    // Large ones count by their bytes.
+    output.unsent.clear();
+    host.publish_next(3);
+    for number in 1..=4 {
+        assert!(!output.is_to_be_paced(), "{number}");
+        output.unsent.push(Forwarded { bytes: 4 << 20, ..unsent(number) });
+    }
+    assert!(output.take().is_none() && output.is_paced());
 }
 
 #[test]

@@ -486,6 +486,11 @@ where
         passed_instant = max(passed_instant, timestamp);
         continue;
       }
+      // The other reader of the topic has taken it, and it stays in the cache for a while.
+      if cc.data_value.is_taken() {
+        passed_instant = max(passed_instant, timestamp);
+        continue;
+      }
 
       let result = self.deserialize_with(timestamp, cc, known_keys, decoder.clone());
 
