@@ -67,7 +67,7 @@ fn load(arguments: &ConfigArguments) -> Result<Settings, ConfigError> {
 }
 
 /// What the budget must be, if ingress cannot start with it: the pools take more at the start.
-fn too_small_budget(settings: &Settings) -> Option<String> {
+pub(super) fn too_small_budget(settings: &Settings) -> Option<String> {
     let pools = (0..settings.routes.len()).map(|route| RouteChannel::of(settings, route).pool_size());
     let (slots, first_bytes) = pools.fold((0, 0_u64), |(slots, bytes), pool| {
         (slots + pool.slots, bytes.saturating_add(pool.first_bytes))

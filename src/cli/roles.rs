@@ -5,8 +5,9 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use super::{ConfigArguments, EXIT_UNUSED, bad_configuration, failed, pause};
-use crate::config::Configuration;
+use super::check::too_small_budget;
+use super::{ConfigArguments, EXIT_CONFIG, EXIT_UNUSED, bad_configuration, failed, pause};
+use crate::config::{Configuration, SetParameters, Standby};
 use crate::process::{self, HangUp, InForce, InForceError, ReloadRequests, RoleError, Stop};
 use crate::telemetry;
 
@@ -33,17 +34,49 @@ pub(super) struct UpArguments {
     config: ConfigArguments,
 }
 
+/// Environment variable of the services of the standbys.
+const STANDBY_VARIABLE: &str = "ADAPTIVE_BRIDGE_STANDBY";
+
 pub(super) fn ingress(arguments: &ConfigArguments) -> Result<ExitCode, ExitCode> {
-    role(arguments, |configuration, reloads, stop| process::ingress(&configuration.settings, reloads, stop))
+    let mut ends_with = None;
+    let code = role(arguments, |Configuration { settings, .. }, reloads, stop| {
+        // No restart changes that, and a standby must not report that it is ready.
+        if let Some(problem) = too_small_budget(settings) {
+            failed(&format!("shared_memory.budget_bytes {problem}"));
+            ends_with = Some(EXIT_CONFIG);
+            return Ok(());
+        }
+        if ends_standby(settings.ingress_standby, "ingress") {
+            ends_with = Some(EXIT_UNUSED);
+            return Ok(());
+        }
+        process::ingress(settings, reloads, stop)
+    })?;
+    Ok(ends_with.map_or(code, ExitCode::from))
+}
+
+/// Ends the service of a standby that the configuration does not have any more: the other process of the role
+/// serves it alone.
+fn ends_standby(standby: Standby, role: &str) -> bool {
+    let ends = standby == Standby::None && std::env::var_os(STANDBY_VARIABLE).is_some();
+    if ends {
+        process::end_standby(role);
+    }
+    ends
 }
 
 pub(super) fn egress(arguments: &EgressArguments) -> Result<ExitCode, ExitCode> {
     let mut unused = false;
     let code = role(&arguments.config, |configuration, reloads, stop| {
         let settings = &configuration.settings;
-        unused = settings.lanes.iter().any(|lane| lane.name.as_str() == arguments.lane && !lane.is_used());
+        let lane = settings.lanes.iter().find(|lane| lane.name.as_str() == arguments.lane);
+        unused = lane.is_some_and(|lane| !lane.is_used());
         if unused {
             process::end_unused(&arguments.lane);
+            return Ok(());
+        }
+        unused = lane.is_some_and(|lane| ends_standby(lane.standby, &arguments.lane));
+        if unused {
             return Ok(());
         }
         process::egress(settings, &arguments.lane, reloads, stop)
@@ -60,8 +93,10 @@ pub(super) fn control(arguments: &ConfigArguments) -> Result<ExitCode, ExitCode>
 pub(super) fn up(arguments: &UpArguments) -> Result<ExitCode, ExitCode> {
     let hang_up = HangUp::on_signal().map_err(|error| failed(&error))?;
     // `up` starts the whole bridge, so it reads the file and not the configuration in force.
-    let configuration =
-        arguments.config.try_load_configuration().map_err(|error| bad_configuration(&error))?;
+    let configuration = arguments
+        .config
+        .try_load_with_budget(&SetParameters::new(), &too_small_budget)
+        .map_err(|error| bad_configuration(&error))?;
     telemetry::set_verbosity(configuration.settings.diagnostics.verbosity);
     let mut child_arguments: Vec<OsString> = match arguments.config.path() {
         Some(path) => vec!["--config".into(), path.into()],

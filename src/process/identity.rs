@@ -12,6 +12,7 @@ use tracing::{info, warn};
 
 use super::error::RoleError;
 use super::kept_sockets;
+use super::place::MAX_AWAY_MS;
 use super::role::Role;
 use super::standby::{Leave, Successor};
 use crate::clock;
@@ -23,9 +24,6 @@ use crate::shm::{BoardWriter, Journal, ProcessRole};
 /// Processes of one version continue each other, also if they are of different releases: an upgrade changes
 /// nothing for subscribers. To be raised with what a participant announces and with the journal's content.
 const VERSION: u32 = 1;
-
-/// The longest time without a process, below the lease of 15 s: then others drop the participant.
-const MAX_AWAY_MS: u64 = 10_000;
 
 /// How long a process that has taken an identity over runs until it has proven that this is not what ends it.
 const PROVEN_AFTER_MS: u64 = 1_000;

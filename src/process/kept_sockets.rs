@@ -69,6 +69,11 @@ pub(super) fn inherited() -> Vec<UdpSocket> {
     sockets
 }
 
+/// Whether the supervisor passes sockets to this process.
+pub(super) fn are_inherited() -> bool {
+    !passed(|name| env::var(name).ok()).is_empty()
+}
+
 /// Gives the supervisor duplicates of the sockets, to keep for the next process. It ignores those that it has
 /// already. Does nothing without a supervisor.
 ///
@@ -132,7 +137,13 @@ pub(super) fn receive(socket: &impl AsRawFd) -> Option<Request> {
             fds.extend(received.into_iter().map(|fd| unsafe { OwnedFd::from_raw_fd(fd) }));
         }
     }
-    let length = message.bytes;
+    let (length, is_cut_off) = (message.bytes, message.flags.contains(MsgFlags::MSG_CTRUNC));
+    if is_cut_off {
+        // The kernel has opened the first ones, of which nix lists none.
+        close_listed(&attached);
+        warn!("this process has no file descriptors left for the sockets of another one");
+        return Some(Request::Unknown);
+    }
     Some(match bytes.get(..length) {
         Some(text) if text == STORE.as_bytes() => {
             fds.retain(|fd| {
@@ -145,6 +156,17 @@ pub(super) fn receive(socket: &impl AsRawFd) -> Option<Request> {
         Some(text) if text == STOPPING.as_bytes() => Request::Stopping,
         _ => Request::Unknown,
     })
+}
+
+/// Closes the file descriptors in the control message of a message whose list of them was cut off: its
+/// length, level and type take 16 bytes (cmsg(3)).
+fn close_listed(control: &[u8]) {
+    let length = control.first_chunk().map_or(0, |length| usize::from_ne_bytes(*length));
+    let listed = control.get(16..length.min(control.len())).unwrap_or_default();
+    for fd in listed.as_chunks().0 {
+        // SAFETY: the kernel has just opened it for this message, so nothing else owns it.
+        drop(unsafe { OwnedFd::from_raw_fd(RawFd::from_ne_bytes(*fd)) });
+    }
 }
 
 /// Sends a message and duplicates of `fds`.

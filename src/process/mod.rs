@@ -34,7 +34,7 @@ mod test_role;
 
 pub use allocator::bound_free_memory;
 pub use control::control;
-pub use egress::{egress, end_unused};
+pub use egress::{egress, end_standby, end_unused};
 pub use error::RoleError;
 pub use in_force::{InForce, InForceError};
 pub use ingress::ingress;

@@ -15,6 +15,9 @@ const STATUS_MS: u64 = 1_000;
 /// Watchdog messages per watchdog timeout, so that one late message does not restart the process.
 const FEEDS_PER_TIMEOUT: u32 = 4;
 
+/// How long a start may take, in microseconds: `TimeoutStartSec` of the services.
+const START_US: u32 = 30_000_000;
+
 /// Sends the state of this process to its service manager.
 #[derive(Debug)]
 pub(super) struct Notifier {
@@ -48,6 +51,21 @@ impl Notifier {
     pub fn ready(&mut self) {
         if !std::mem::replace(&mut self.ready, true) {
             send(&[NotifyState::Ready]);
+        }
+    }
+
+    /// Gives the process as much time until its next turn as a service has for its start.
+    pub fn allow_start(&self) {
+        if self.feed_every.is_some() {
+            send(&[NotifyState::WatchdogUsec(START_US)]);
+        }
+    }
+
+    /// Ends that time.
+    pub fn end_start(&self) {
+        if let Some(timeout) = self.feed_every.map(|every| every * FEEDS_PER_TIMEOUT) {
+            let usec = u32::try_from(timeout.as_micros()).unwrap_or(u32::MAX);
+            send(&[NotifyState::WatchdogUsec(usec), NotifyState::Watchdog]);
         }
     }
 

@@ -3,12 +3,18 @@
 use tracing::info;
 
 use super::error::RoleError;
+use super::kept_sockets;
 use super::reload::{ReloadRequests, WaitingReloads};
 use super::scheduling;
 use super::standby::{TakeOver, Waiting};
 use super::stop::Stop;
+use crate::clock;
 use crate::config::{self, Scheduling, Settings};
+use crate::model::{Guid, MonotonicNs};
 use crate::shm::{Boards, BridgeShape, ProcessRole, RoleLock, ShmError, ShmNode, root_of};
+
+/// The longest time without a process, below the lease of 15 s: then others drop the participant.
+pub(super) const MAX_AWAY_MS: u64 = 10_000;
 
 /// What a process has before it opens anything of DDS.
 pub(super) struct Place {
@@ -59,7 +65,11 @@ impl Place {
             lock => Some(lock?),
         };
         let (node, boards) = attach(settings, name, scheduling)?;
-        if let Some(lock) = lock {
+        // If both processes of the role have died, the one whose supervisor has the sockets goes first.
+        let gives_way = standby == config::Standby::Warm
+            && !kept_sockets::are_inherited()
+            && has_died_lately(&boards, role.0, clock::monotonic());
+        if let Some(lock) = lock.filter(|_| !gives_way) {
             return Ok(Some(Self { lock, node, boards, reloads, take_over: None }));
         }
         let Some(mut waiting) = Waiting::open(settings, role, &boards, stop)? else { return Ok(None) };
@@ -72,6 +82,15 @@ impl Place {
     pub fn settings(&self) -> &Settings {
         &self.reloads.in_force.settings
     }
+}
+
+/// Whether a process of that role has died lately, whose sockets its supervisor keeps for another process.
+fn has_died_lately(boards: &Boards, role: ProcessRole, now: MonotonicNs) -> bool {
+    boards.identity(role).is_some_and(|left| {
+        left.is_intact()
+            && left.participant != Guid::default()
+            && now.since(left.alive_at) <= MAX_AWAY_MS * 1_000_000
+    })
 }
 
 fn attach(settings: &Settings, name: &str, scheduling: &Scheduling) -> Result<(ShmNode, Boards), RoleError> {

@@ -138,6 +138,8 @@ pub(super) struct WaitingReloads {
     parameters: Option<ParameterStore>,
     outcomes: Receiver<Outcome>,
     begin: SyncSender<(Reloader, PathBuf)>,
+    /// Whether requests that have come so far were for another process.
+    is_refreshed: Arc<AtomicBool>,
 }
 
 impl WaitingReloads {
@@ -152,19 +154,27 @@ impl WaitingReloads {
         // Of capacity 0: the thread writes the note only after housekeeping has taken the outcome.
         let (sender, outcomes) = sync_channel(0);
         let (begin, begun) = sync_channel::<(Reloader, PathBuf)>(1);
+        let is_refreshed = Arc::new(AtomicBool::new(false));
+        let drops_requests = Arc::clone(&is_refreshed);
         let thread = std::thread::Builder::new().name("reload".to_owned());
         #[allow(clippy::disallowed_methods, reason = "this thread handles no samples")]
         thread.spawn(move || {
             // An error is the end of a process that got no role.
             if let Ok((reloader, note)) = begun.recv() {
+                let mut request = request;
+                if drops_requests.load(Ordering::Acquire) {
+                    request.signals.pending().for_each(drop);
+                }
                 serve(request, reloader, &sender, &note);
             }
         })?;
-        Ok(Self { in_force, share, parameters, outcomes, begin })
+        Ok(Self { in_force, share, parameters, outcomes, begin, is_refreshed })
     }
 
-    /// Reads what the other processes have put in force since this one was started.
+    /// Reads what the other processes have put in force since this one was started. The requests that came
+    /// meanwhile were for the process that it waited for: the file may have been edited since.
     pub fn refresh(&mut self) {
+        self.is_refreshed.store(true, Ordering::Release);
         let Some(share) = &self.share else { return };
         let stored = share.file().read().ok().flatten();
         if let Some(stored) = stored.and_then(|bytes| Configuration::decode(&bytes).ok()) {

@@ -191,6 +191,9 @@ impl Waiting {
             let has_sockets = !self.sockets.is_empty() || self.is_taken_back;
             if has_sockets || self.ended_at.since(since) > GIVE_WAY_MS * 1_000_000 {
                 info!(role = name, sockets = self.sockets.len(), "standby: takes the role over");
+                // From here on it is a process that starts, also for the watchdogs.
+                notifier.allow_start();
+                self.board.update(|board| board.pid = 0);
                 return Ok(Some(lock));
             }
         }
@@ -286,6 +289,7 @@ impl TakeOver {
                 ..StandbyRecord::default()
             };
         });
+        Notifier::new().end_start();
         info!(%cause, took_ms = took_ns as f64 / 1e6, "standby: has taken the role over");
     }
 }

@@ -6,6 +6,7 @@
 
 use std::ffi::OsString;
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
+use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
@@ -33,6 +34,9 @@ use crate::telemetry::{ProcessReading, Snapshot, Threads};
 
 /// Interval at which the supervisor checks for requests, and its children if no signal tells that one ended.
 const POLL_MS: u64 = 20;
+
+/// The program of this process, also if its file was replaced since.
+const OWN_PROGRAM: &str = "/proc/self/exe";
 
 /// Interval of reading the boards, for the progress of the children and the service manager.
 const READ_BOARDS_MS: u64 = 250;
@@ -387,7 +391,11 @@ impl Supervised {
 
     fn start(&mut self) -> io::Result<()> {
         let program = std::env::current_exe()?;
-        let mut command = Command::new(&program);
+        // The file may have been replaced since `up` was started, as by an upgrade. Another version may not
+        // share the boards with the children that run.
+        let identity = |path: &Path| path.metadata().map(|file| (file.dev(), file.ino())).ok();
+        let is_same = identity(&program) == identity(Path::new(OWN_PROGRAM));
+        let mut command = Command::new(if is_same { &program } else { Path::new(OWN_PROGRAM) });
         // A copy of the program may have the name of an executable of the original package.
         command.arg0(program.with_file_name("adaptive-bridge"));
         if !self.watchdog {

@@ -62,7 +62,7 @@ impl BacklogKeeper {
         let start = StartLock::take(shared.dir())?;
         let factory = channel.open(shared, &start)?;
         let what = format!("the backlog of route {}", channel.route);
-        shared.require_free(0, &what)?;
+        shared.require_free(0, &what, &start)?;
         let create = || factory.subscriber_builder().buffer_size(channel.depth(queue)).create();
         let port = match create() {
             // A dead former process counts until it is cleaned up.

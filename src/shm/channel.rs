@@ -211,7 +211,7 @@ impl RouteChannel {
         let mut attempt = 0;
         loop {
             attempt += 1;
-            shared.require_free(0, &format!("route {}", self.route))?;
+            shared.require_free(0, &format!("route {}", self.route), start)?;
             let opened = shared
                 .node
                 .service_builder(&name)

@@ -127,8 +127,12 @@ impl NodeShared {
         commit_files(&self.dir().shm_files(), what)
     }
 
-    /// Returns an error if shared memory has no room for that many bytes and the overhead of a port.
-    pub(super) fn require_free(&self, bytes: u64, what: &str) -> Result<(), ShmError> {
+    /// Returns an error if shared memory has no room for that many bytes and the overhead of a port, not even
+    /// without what dead processes have left: a standby takes over before that is removed.
+    pub(super) fn require_free(&self, bytes: u64, what: &str, start: &StartLock) -> Result<(), ShmError> {
+        if require_free(bytes + SMALL_BYTES, what).is_err() {
+            self.clean_up(start);
+        }
         require_free(bytes + SMALL_BYTES, what)
     }
 }

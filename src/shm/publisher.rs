@@ -93,7 +93,7 @@ impl SamplePublisher {
         let what = format!("the sample pool of route {} ({} slots)", channel.route, pool.slots);
         let start = StartLock::take(shared.dir())?;
         let factory = channel.open(shared, &start)?;
-        shared.require_free(pool.first_bytes, &what)?;
+        shared.require_free(pool.first_bytes, &what, &start)?;
         let create = || {
             factory
                 .publisher_builder()

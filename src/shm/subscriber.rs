@@ -87,7 +87,7 @@ impl SampleSubscriber {
         let start = StartLock::take(shared.dir())?;
         let factory = channel.open(shared, &start)?;
         let what = format!("a queue of route {}", channel.route);
-        shared.require_free(0, &what)?;
+        shared.require_free(0, &what, &start)?;
         let create = || {
             factory
                 .subscriber_builder()

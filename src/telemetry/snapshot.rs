@@ -24,8 +24,9 @@ const WHOLE_ATTEMPTS: usize = 100;
 /// See [`WHOLE_ATTEMPTS`].
 const WHOLE_PAUSE: Duration = Duration::from_micros(200);
 
-/// A standby that has not checked its role for this long is gone; it does so each 50 ms.
-const STANDBY_SILENT_MS: u64 = 2_000;
+/// A standby that has not checked its role for this long is gone; it does so each 50 ms. Longer than the
+/// watchdog of `up` waits, which kills one that hangs.
+const STANDBY_SILENT_MS: u64 = 3_000;
 
 /// The state of a bridge at one time, read from its boards. Reading blocks no process, so the boards are read
 /// one after the other and may differ by the time that this takes.

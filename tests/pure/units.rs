@@ -84,12 +84,28 @@ fn only_ingress_and_the_critical_lane_may_use_real_time_scheduling_and_lock_memo
 #[test]
 fn a_standby_has_the_settings_of_the_service_that_it_takes_over_from() {
     let service = |unit: &str| {
-        let of_unit = ["Description=", "Documentation=", "PartOf=", "After=", "ExecStart="];
+        let of_unit = [
+            "Description=",
+            "Documentation=",
+            "PartOf=",
+            "After=",
+            "ExecStart=",
+            "Environment=ADAPTIVE_BRIDGE_STANDBY=",
+        ];
         let settings = settings(unit).into_iter();
         settings.filter(|line| !of_unit.iter().any(|name| line.starts_with(name))).collect::<BTreeSet<_>>()
     };
     let [ingress, critical, of_ingress, of_critical] = CRITICAL.map(service);
     assert_eq!((ingress, critical), (of_ingress, of_critical));
+}
+
+#[test]
+fn what_reads_no_file_has_no_reload() {
+    // SIGHUP ends the responder.
+    let reloads = |unit: &str| settings(unit).contains("ExecReload=kill -HUP $MAINPID");
+    assert!(!reloads(COMMON) && !reloads("adaptive-bridge-responder@.service"));
+    let services = CRITICAL.into_iter().chain(OTHERS).filter(|unit| unit.ends_with(".service"));
+    assert_eq!(services.filter(|unit| !reloads(unit)).count(), 1);
 }
 
 #[test]

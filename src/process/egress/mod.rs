@@ -134,6 +134,13 @@ pub fn end_unused(name: &str) {
     Notifier::new().ready();
 }
 
+/// Logs that the service of a standby ends because the configuration has no standby for its role, and reports
+/// to the service manager that it has started as it should.
+pub fn end_standby(role: &str) {
+    info!(role, "the configuration has no standby for this role, so this process ends");
+    Notifier::new().ready();
+}
+
 /// Opens the participant of a lane: that of the former process if the lane is critical and others can't tell
 /// the two apart.
 fn join(
