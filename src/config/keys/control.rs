@@ -16,7 +16,7 @@ pub(super) const ROWS: &[Row] = &[
     reloads(&["routing_policy.noncritical_enabled"], Flag, "`true`")
         .doc("`false`: noncritical lanes forward nothing, at any configured rate."),
     reloads(&["routing_policy.noncritical_max_rate_hz"], Decimal(0.0, 100000.0, " Hz"), "10")
-        .doc("Rate in NORMAL."),
+        .doc("Rate in lane mode `normal`."),
     reloads(&["routing_policy.noncritical_drop_policy"], Choice(words::<DropPolicy>), "`drop_oldest`")
         .doc("Drop policy in all modes."),
     reloads(&["routing_policy.stale_threshold_ms"], AGE, "200")
@@ -31,7 +31,7 @@ pub(super) const ROWS: &[Row] = &[
          noncritical lanes forward nothing.",
     ),
     reloads(&["routing_policy.modes.<mode>.noncritical_depth"], QUEUE, "5 normal, 2 degraded")
-        .doc("Samples of each route that may wait in a lane for a token; 0 counts as 1."),
+        .doc("Samples of each route that may wait in a lane until the rate allows them; 0 counts as 1."),
     reloads(
         &["routing_policy.modes.<mode>.noncritical_drop_policy"],
         Choice(words::<DropPolicy>),
@@ -80,7 +80,8 @@ pub(super) const ROWS: &[Row] = &[
         .doc("The lane of a known subscriber, by its id: `laptop: rviz`, or `laptop: {lane: rviz}`."),
     reloads(&["subscribers.<subscriber>.lane"], Other("a lane"), "must be given, or `null`")
         .doc("The same, in the second form."),
-    reloads(&["overrides.<subscriber>"], Choice(words::<SubscriberState>), "none").doc("A forced state."),
+    reloads(&["overrides.<subscriber>"], Choice(words::<SubscriberState>), "none")
+        .doc("A forced state of the link, as under [classifier](#classifier)."),
     reloads(&["safety.preserve_critical_path"], Flag, "`true`").doc(
         "Whether critical lanes continue in DEGRADED. `false` stops them there, too, but never for faults \
          of noncritical lanes alone.",
@@ -97,8 +98,10 @@ pub(super) const ROWS: &[Row] = &[
     ),
     // At intervals below 50 ms a few errors would count as many errors per second.
     reloads(&["safety.evaluate_rate_hz"], Decimal(0.1, 20.0, " Hz"), "2").doc("Evaluations per second."),
-    reloads(&["safety.degraded_lag_ms"], Decimal(1.0, 3600000.0, " ms"), "500")
-        .doc("A reading with at least this p99 of the processing lag counts for DEGRADED."),
+    reloads(&["safety.degraded_lag_ms"], Decimal(1.0, 3600000.0, " ms"), "500").doc(
+        "A reading with at least this p99 of a lane's lag from shared memory to its writer, or this growth \
+             of the lag from a publisher to shared memory, counts for DEGRADED.",
+    ),
     reloads(&["safety.emergency_lag_ms"], Decimal(1.0, 3600000.0, " ms"), "2000").doc(
         "A reading with at least this p99 of a critical lane's lag, from shared memory to its writer, \
          counts for EMERGENCY.",

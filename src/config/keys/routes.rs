@@ -110,7 +110,7 @@ pub(super) const ROWS: &[Row] = &[
         "Which routes go first: each lane sends waiting samples of a higher number first, and ingress \
          receives critical routes above the lowest number in use on a UDP port of their own; a route on \
          noncritical lanes alone has none. A noncritical lane that has begun to send samples of a lower number \
-         sends all that its tokens allow before it checks for samples of a higher number.",
+         sends all that its rate allows before it checks for samples of a higher number.",
     ),
     restarts(
         &["topics[].retained_samples"],
@@ -188,19 +188,19 @@ pub(super) const ROWS: &[Row] = &[
          acknowledged that one misses it, which counts as its `reader_overrun`.",
     ),
     reloads(&["lanes.<lane>.max_rate_hz"], Decimal(0.0, 100000.0, " Hz"), "`routing_policy`: 10")
-        .doc("Rate in NORMAL. 0 forwards nothing."),
+        .doc("Rate in lane mode `normal`. 0 forwards nothing."),
     reloads(
         &["lanes.<lane>.degraded_rate_hz"],
         Decimal(0.0, 100000.0, " Hz"),
-        "`routing_policy.modes.degraded`; else 3, or the NORMAL rate if that is lower",
+        "`routing_policy.modes.degraded`; else 3, or the rate of `normal` if that is lower",
     )
-    .doc("Rate in DEGRADED."),
+    .doc("Rate in lane mode `degraded`."),
     reloads(&["lanes.<lane>.max_bytes_per_s"], BANDWIDTH, "unlimited")
-        .doc("Payload bytes per second in NORMAL."),
+        .doc("Payload bytes per second in lane mode `normal`."),
     reloads(&["lanes.<lane>.degraded_max_bytes_per_s"], BANDWIDTH, "`max_bytes_per_s`")
-        .doc("The same in DEGRADED."),
+        .doc("The same in lane mode `degraded`."),
     reloads(&["lanes.<lane>.stale_threshold_ms"], AGE, "`routing_policy`: 200").doc(
-        "In NORMAL the lane drops a sample whose age, by its source timestamp, is larger. 0: never. If \
+        "In lane mode `normal` the lane drops a sample whose age, by its source timestamp, is larger. 0: never. If \
          the clock of the publisher's computer is constantly more than 100 ms behind or 50 ms ahead of \
          this one's, the age runs from the arrival instead, plus the delay beyond that publisher's \
          fastest samples; `status` then names the publisher and the offset. It does not apply to a \
@@ -211,13 +211,13 @@ pub(super) const ROWS: &[Row] = &[
         AGE,
         "`routing_policy.modes.degraded`, else `stale_threshold_ms` of the lane",
     )
-    .doc("The same in DEGRADED."),
+    .doc("The same in lane mode `degraded`."),
     reloads(&["lanes.<lane>.drop_policy"], Choice(words::<DropPolicy>), "`routing_policy`")
-        .doc("Which samples are dropped when more wait than tokens accrue, in both modes. See below."),
+        .doc("Which samples are dropped when more wait than the rate allows, in both modes. See below."),
     reloads(&["lanes.<lane>.queue_samples"], Whole(1, 4_096, " samples"), "`noncritical_depth` of the mode")
         .doc(
-            "Samples of each route that may wait in the lane for a token, in both modes. Keep it at or below \
-         `safety.max_noncritical_queue`: a longer queue counts as overflowing, and suspends the \
+            "Samples of each route that may wait in the lane until the rate allows them, in both modes. Keep it at or \
+         below `safety.max_noncritical_queue`: a longer queue counts as overflowing, and suspends the \
          noncritical lanes for a while.",
         ),
     restarts(scheduling!("policy"), Choice(words::<SchedulingPolicy>), "`other`")
@@ -244,7 +244,8 @@ pub(super) const ROWS: &[Row] = &[
         .doc("Lock the memory of the process (`mlockall`), so that it has no page faults."),
     restarts(&["lanes.<lane>.standby", "processes.ingress.standby"], Choice(words::<Standby>), "`none`").doc(
         "`warm`: a second process of the critical lane, or of ingress, waits and takes over when the first one \
-         ends, without the time that a start takes. systemd starts it after `units --write`.",
+         ends, without the time that a start takes. systemd starts it after `units --write`. Other lanes: \
+         `none`.",
     ),
     restarts(&["shared_memory.root_path"], Other("absolute path"), "chosen by the program")
         .doc("Folder of the bridge's own files."),
