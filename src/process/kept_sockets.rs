@@ -125,8 +125,11 @@ pub(super) enum Request {
 /// Receives the next message that has arrived; `None` if there is none. Closes whatever is attached that is
 /// not a socket to store.
 pub(super) fn receive(socket: &impl AsRawFd) -> Option<Request> {
+    receive_with(socket, cmsg_space!([RawFd; MAX_ATTACHED]))
+}
+
+fn receive_with(socket: &impl AsRawFd, mut attached: Vec<u8>) -> Option<Request> {
     let mut bytes = [0; 64];
-    let mut attached = cmsg_space!([RawFd; MAX_ATTACHED]);
     let mut parts = [IoSliceMut::new(&mut bytes)];
     let flags = MsgFlags::MSG_DONTWAIT | MsgFlags::MSG_CMSG_CLOEXEC;
     let message = recvmsg::<()>(socket.as_raw_fd(), &mut parts, Some(&mut attached), flags).ok()?;
@@ -284,6 +287,25 @@ mod tests {
         let inherited = inherit(own.into_raw_fd()).unwrap();
         assert_eq!(inherited.local_addr().unwrap(), address);
         assert!(is_close_on_exec(inherited.as_fd()).unwrap());
+    }
+
+    #[test]
+    fn what_arrives_of_a_list_that_is_cut_off_is_closed() {
+        let (receiving, sending) = UnixDatagram::pair().unwrap();
+        let pairs = [(); 3].map(|()| UnixDatagram::pair().unwrap());
+        let fds = pairs.each_ref().map(|(one, _)| one.as_raw_fd());
+        send(sending.as_raw_fd(), STORE, &fds).unwrap();
+        // As if this process had room for two file descriptors; the third one the kernel closes.
+        let received = receive_with(&receiving, cmsg_space!([RawFd; 2]));
+        assert!(matches!(received, Some(Request::Unknown)));
+        for (one, other) in pairs {
+            drop(one);
+            let error = other.send(b"").unwrap_err();
+            assert_eq!(error.kind(), io::ErrorKind::ConnectionRefused, "a duplicate is open");
+        }
+        send(sending.as_raw_fd(), STORE, &[]).unwrap();
+        let received = receive_with(&receiving, cmsg_space!([RawFd; 2]));
+        assert!(matches!(received, Some(Request::Store(sockets)) if sockets.is_empty()));
     }
 
     #[test]

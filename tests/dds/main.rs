@@ -13,3 +13,4 @@ mod metrics;
 mod patterns;
 mod priority;
 mod reload;
+mod up;

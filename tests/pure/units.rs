@@ -90,6 +90,7 @@ fn a_standby_has_the_settings_of_the_service_that_it_takes_over_from() {
             "PartOf=",
             "After=",
             "ExecStart=",
+            "ExecReload=",
             "Environment=ADAPTIVE_BRIDGE_STANDBY=",
         ];
         let settings = settings(unit).into_iter();

@@ -393,9 +393,9 @@ pub(super) mod tests {
         assert_eq!(
             take_overs(5),
             [
-                "the standby of egress-critical took over 5 times, each time within a minute of the last, because the \
-                 active process ended: read its log for the cause; samples are lost when it fails before the next standby \
-                 has started",
+                "the standby of egress-critical took over 5 times, each time within a minute of the last, because \
+                 the active process ended: read its log for the cause; samples are lost when it fails before the \
+                 next standby has started",
             ]
         );
     }

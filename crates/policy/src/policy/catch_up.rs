@@ -39,8 +39,8 @@ pub struct CatchUp {
 }
 
 impl CatchUp {
-    /// Of a lane that starts `now`, whose writer retains `window_samples` for readers that lack them. The former
-    /// process had these readers.
+    /// Of a lane that starts `now`, whose writer retains `window_samples` for readers that lack them. The
+    /// former process had these readers.
     pub fn of_critical<'a>(
         window_samples: usize,
         former: impl IntoIterator<Item = &'a ReaderRecord>,
@@ -66,8 +66,8 @@ impl CatchUp {
         }
     }
 
-    /// Whether the lane waits with the next sample because so many samples, which have so many bytes together,
-    /// wait in the DDS library: it would discard the oldest.
+    /// Whether the lane waits with the next sample because so many samples, with so many bytes in all, wait in
+    /// the DDS library: it would discard the oldest.
     pub const fn is_full(&self, unsent: u64, unsent_bytes: u64) -> bool {
         unsent >= self.most_unacknowledged
             || (self.most_unacknowledged < u64::MAX && unsent_bytes >= MAX_UNACKNOWLEDGED_BYTES)
