@@ -1,9 +1,11 @@
 //! Large samples between stock nodes: Fast DDS leaves its receive buffer at the kernel's 208 KiB, a fifth of
 //! a sample, and loses some of most samples, also without the bridge.
 
+use nix::sys::signal::Signal;
 use serde_json::Value;
-use support::bed::Bed;
+use support::bed::{Bed, outputs};
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
+use support::process::signal;
 use support::ros;
 
 const YAML: &str = "topics:\n  - {id: cloud, input_topic: /cloud, message_type: sensor_msgs/msg/PointCloud2, \
@@ -44,6 +46,34 @@ fn a_full_hd_image_and_a_map_of_4_mb_pass_with_the_default_configuration() {
         subscriber.end::<Received>().assert_all_of(&sent);
     }
     bed.wait_accounted();
+    bed.end();
+}
+
+/// Of what the lane sends at once after the stop, its writer would discard what is more than 32 MiB.
+#[test]
+fn a_lane_that_was_stopped_sends_every_image() {
+    let test = "a_lane_that_was_stopped_sends_every_image";
+    // It asserts that no sample is lost.
+    let _alone = support::exclusive();
+    let yaml = "topics:\n  - {id: image, input_topic: /image, message_type: sensor_msgs/msg/Image}\n";
+    let Some(bed) = Bed::start_without_watchdog(test, yaml) else { return };
+    let peer = || Peer::cyclone().keep_all().type_name("sensor_msgs::msg::dds_::Image_").size(6_220_800);
+    let subscriber = bed.subscribe("critical", peer(), "rt/adaptive_bridge/critical/image");
+    let publisher = bed.publish(peer().rate_hz(15.0), "rt/image");
+    for _ in 0..3 {
+        subscriber.wait_received(subscriber.received() + 10);
+        let lane = bed.pid("egress-critical");
+        signal(lane, Signal::SIGSTOP);
+        #[allow(clippy::disallowed_methods, reason = "twelve periods of the publisher")]
+        std::thread::sleep(std::time::Duration::from_millis(800));
+        signal(lane, Signal::SIGCONT);
+    }
+    let sent: Sent = publisher.end();
+    subscriber.wait_received(sent.ok);
+    subscriber.end::<Received>().assert_all_of(&sent);
+    let status = bed.wait_accounted();
+    let output = outputs(&status).find(|output| output["lane"] == "critical").unwrap();
+    assert_eq!(output["reader_overrun"], 0, "{output}");
     bed.end();
 }
 
