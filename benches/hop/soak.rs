@@ -18,9 +18,8 @@ const SCANS_S: f64 = 10.0;
 /// The part of each turn in which point clouds are sent, which the bridge forwards by reference.
 const CLOUDS_S: f64 = 8.0;
 
-/// How often publisher and subscriber are restarted before the measurement: 7 minutes. The memory of a process
-/// grows until some 1,600 participants have come and gone, as the bridge remembers what the last 256 have
-/// announced, and the datagrams of the last 1,024; then it is constant.
+/// How often publisher and subscriber are restarted before the measurement: 7 minutes. The memory of a
+/// process grew until some 1,600 participants had come and gone, and was constant then.
 const RESTARTS_BEFORE: usize = 800;
 
 /// The highest number of points of a series in the summary.

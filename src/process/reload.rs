@@ -137,9 +137,9 @@ pub(super) struct WaitingReloads {
     share: Option<InForceShare>,
     parameters: Option<ParameterStore>,
     outcomes: Receiver<Outcome>,
-    begin: SyncSender<(Reloader, PathBuf)>,
+    begin: SyncSender<(Reloader, PathBuf, bool)>,
     /// Whether requests that have come so far were for another process.
-    is_refreshed: Arc<AtomicBool>,
+    is_refreshed: bool,
 }
 
 impl WaitingReloads {
@@ -153,28 +153,26 @@ impl WaitingReloads {
         let parameters = file.map(|file| ParameterStore::new(Arc::clone(&request.load), file));
         // Of capacity 0: the thread writes the note only after housekeeping has taken the outcome.
         let (sender, outcomes) = sync_channel(0);
-        let (begin, begun) = sync_channel::<(Reloader, PathBuf)>(1);
-        let is_refreshed = Arc::new(AtomicBool::new(false));
-        let drops_requests = Arc::clone(&is_refreshed);
+        let (begin, begun) = sync_channel::<(Reloader, PathBuf, bool)>(1);
         let thread = std::thread::Builder::new().name("reload".to_owned());
         #[allow(clippy::disallowed_methods, reason = "this thread handles no samples")]
         thread.spawn(move || {
             // An error is the end of a process that got no role.
-            if let Ok((reloader, note)) = begun.recv() {
+            if let Ok((reloader, note, is_refreshed)) = begun.recv() {
                 let mut request = request;
-                if drops_requests.load(Ordering::Acquire) {
+                if is_refreshed {
                     request.signals.pending().for_each(drop);
                 }
                 serve(request, reloader, &sender, &note);
             }
         })?;
-        Ok(Self { in_force, share, parameters, outcomes, begin, is_refreshed })
+        Ok(Self { in_force, share, parameters, outcomes, begin, is_refreshed: false })
     }
 
     /// Reads what the other processes have put in force since this one was started. The requests that came
     /// meanwhile were for the process that it waited for: the file may have been edited since.
     pub fn refresh(&mut self) {
-        self.is_refreshed.store(true, Ordering::Release);
+        self.is_refreshed = true;
         let Some(share) = &self.share else { return };
         let stored = share.file().read().ok().flatten();
         if let Some(stored) = stored.and_then(|bytes| Configuration::decode(&bytes).ok()) {
@@ -186,7 +184,8 @@ impl WaitingReloads {
     pub fn begin(self, note: PathBuf) -> Reloads {
         let file = self.share.as_ref().map(InForceShare::file);
         // The thread waits for this message.
-        let _ = self.begin.send((Reloader { current: self.in_force.clone(), file }, note));
+        let reloader = Reloader { current: self.in_force.clone(), file };
+        let _ = self.begin.send((reloader, note, self.is_refreshed));
         Reloads {
             in_force: self.in_force,
             refused: 0,

@@ -8,11 +8,12 @@ use serde_json::Value;
 use support::bridge::{Bridge, program};
 use support::process::{Process, signal};
 
-fn bridge(domain_id: u16, more: &str) -> Bridge {
+/// `shared_memory` are more of its keys.
+fn bridge(domain_id: u16, shared_memory: &str) -> Bridge {
     Bridge::new(&format!(
         "instance: {{instance}}\nros: {{domain_id: {domain_id}}}\n\
-         topics:\n  - {{id: scan, input_topic: /scan, max_sample_bytes: 8192}}\n{more}\
-         shared_memory: {{root_path: {{folder}}/root}}\n"
+         topics:\n  - {{id: scan, input_topic: /scan, max_sample_bytes: 8192}}\n\
+         shared_memory: {{root_path: {{folder}}/root{shared_memory}}}\n"
     ))
 }
 
@@ -48,9 +49,7 @@ fn up_restarts_a_process_after_its_program_was_replaced() {
 
 #[test]
 fn a_budget_with_which_ingress_cannot_start_is_a_bad_configuration() {
-    let bridge = bridge(117, "");
-    let file = fs::read_to_string(bridge.config()).unwrap();
-    bridge.write_config(&file.replace("/root}", "/root, budget_bytes: 1048576, max_taps: 64}"));
+    let bridge = bridge(117, ", budget_bytes: 1048576, max_taps: 64");
     for role in ["check", "up", "ingress"] {
         let output = bridge.run(role);
         let stderr = String::from_utf8(output.stderr).unwrap();

@@ -69,8 +69,8 @@ impl CatchUp {
     /// Whether the lane waits with the next sample because so many samples, with so many bytes in all, are
     /// unsent: the DDS library would discard the oldest.
     pub const fn is_full(&self, unsent: u64, unsent_bytes: u64) -> bool {
-        unsent >= self.most_unacknowledged
-            || (self.most_unacknowledged < u64::MAX && unsent_bytes >= MAX_UNACKNOWLEDGED_BYTES)
+        !matches!(self.state, State::Never)
+            && (unsent >= self.most_unacknowledged || unsent_bytes >= MAX_UNACKNOWLEDGED_BYTES)
     }
 
     /// How many samples a lane takes one after the other before it counts as behind.

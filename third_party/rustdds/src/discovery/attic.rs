@@ -2,9 +2,9 @@
 //!
 //! What each has announced is one block of memory: its announcements as they go over the network.
 //! As values, those of a ROS 2 node are about a hundred allocations, which share their pages with
-//! others, so that the memory of a process grows although nothing is kept for long. The block has
-//! the participant's announcement also after a goodbye, for which nobody asks then: so a
-//! process needs the same memory however participants leave.
+//! others, so that the memory of a process grows although nothing is kept for long. After a goodbye
+//! the participant's announcement is kept and not used, so that a process needs the same memory
+//! however participants leave.
 
 use std::collections::VecDeque;
 
