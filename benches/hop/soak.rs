@@ -12,15 +12,18 @@ use super::options::{Case, Options, SCAN};
 use super::out::{Output, RowKey};
 use super::system::{Usage, descriptors};
 
-/// The part of each turn in which scans are sent. With the rest of the turn 20 s, the time after which
-/// publisher and subscriber are restarted: in 90 minutes as often as in four hours with a restart a minute.
-const SCANS_S: f64 = 10.0;
+/// The part of each turn in which scans are sent. With the rest of the turn 17 s, the time after which
+/// publisher and subscriber are restarted: in 70 minutes as often as in four hours with a restart a minute.
+const SCANS_S: f64 = 9.0;
 /// The part of each turn in which point clouds are sent, which the bridge forwards by reference.
-const CLOUDS_S: f64 = 8.0;
+const CLOUDS_S: f64 = 7.0;
 
 /// How often publisher and subscriber are restarted before the measurement: 7 minutes. The memory of a
 /// process grew until some 1,600 participants had come and gone, and was constant then.
 const RESTARTS_BEFORE: usize = 800;
+/// Of these restarts one in so many is by SIGKILL: 400 participants, more than the 256 that a process
+/// remembers of those whose lease ended.
+const KILLED_BEFORE: usize = 4;
 
 /// The highest number of points of a series in the summary.
 const MAX_POINTS: usize = 400;
@@ -33,14 +36,15 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
     let mut soak = Soak {
         load: format!(
             "{} for {SCANS_S} s and {} for {CLOUDS_S} s, in turn; publisher and subscriber are restarted after \
-             each turn, one time in two by SIGKILL, and {RESTARTS_BEFORE} times before",
+             each turn, one time in two by SIGKILL, and {RESTARTS_BEFORE} times before, one in {KILLED_BEFORE} \
+             by SIGKILL",
             scans.name(),
             clouds.name()
         ),
         ..Soak::default()
     };
     for restart in 1..=RESTARTS_BEFORE {
-        bed.restart_peers(Ending::Normal)?;
+        bed.restart_peers(if restart % KILLED_BEFORE == 0 { Ending::Killed } else { Ending::Normal })?;
         if restart % 100 == 0 {
             eprintln!("soak: {restart} of {RESTARTS_BEFORE} restarts before the measurement");
         }
