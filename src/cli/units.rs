@@ -21,12 +21,9 @@ pub(super) const FOLDER: &str = "/etc/systemd/system";
 const INGRESS: &str = "adaptive-bridge-ingress.service";
 const CONTROL: &str = "adaptive-bridge-control.service";
 
-/// The services of the standbys, which the target starts only if the configuration has standbys.
+/// The services of the standbys. Without a standby in the configuration they end at once.
 const INGRESS_STANDBY: &str = "adaptive-bridge-standby-ingress.service";
 const CRITICAL_STANDBY: &str = "adaptive-bridge-standby-critical.service";
-
-/// Lets a standby see whether the active process, which has a user namespace of its own, is stopped.
-const SEE_PROCESSES: &str = "ProtectProc=default";
 
 /// The first line of each written drop-in, by which a later run recognises it.
 const HEADER: &str =
@@ -124,7 +121,6 @@ impl DropIns {
         let lanes = settings.lanes.iter().filter(|lane| !installed.contains(&lane.name.as_str()));
         let standbys = standbys(settings);
         let wants = lanes.map(|lane| format!("Wants={}", egress(lane.name.as_str())));
-        let wants = wants.chain(standbys.iter().map(|(_, standby)| format!("Wants={standby}")));
         add("adaptive-bridge.target".to_owned(), "Unit", wants.collect());
 
         let limits = memory_limits(settings);
@@ -138,8 +134,7 @@ impl DropIns {
             let standby =
                 standbys.iter().find(|(of, _)| *of == unit).map(|(_, standby)| (*standby).to_owned());
             let limit = limits.get(&unit).map(|bytes| memory_max(*bytes));
-            let sees = standby.is_some().then(|| SEE_PROCESSES.to_owned());
-            let own = own.into_iter().chain(sees).chain(limit).collect();
+            let own = own.into_iter().chain(limit).collect();
             let lines = [common.clone(), scheduling(configured, critical), own].concat();
             // Either of the two may have the role.
             for unit in [unit].into_iter().chain(standby) {
@@ -313,7 +308,11 @@ mod tests {
         let drop_ins = DropIns::of(&settings(PLAIN), Path::new(config::DEFAULT_PATH));
         let units: Vec<&str> = drop_ins.0.keys().map(String::as_str).collect();
         let [critical, noncritical] = ["critical", "noncritical"].map(egress);
-        assert_eq!(units, [CONTROL, &critical, &noncritical, INGRESS, NONCRITICAL_SLICE]);
+        let standbys = [CRITICAL_STANDBY, INGRESS_STANDBY];
+        assert_eq!(
+            units,
+            [&[CONTROL, &critical, &noncritical, INGRESS, NONCRITICAL_SLICE], &standbys[..]].concat()
+        );
         for (unit, text) in &drop_ins.0 {
             assert!(without_memory(text).is_empty() && text.contains("\nMemoryMax="), "{unit}: {text}");
         }
@@ -375,17 +374,15 @@ mod tests {
     }
 
     #[test]
-    fn a_standby_is_started_and_has_what_the_service_has() {
-        let warm = format!("{PLAIN}lanes: {{critical: {{standby: warm}}}}\n");
-        let drop_ins = DropIns::of(&settings(&warm), Path::new("/srv/bridge.yaml")).0;
-        let target = &drop_ins["adaptive-bridge.target"];
-        assert!(target.ends_with("[Unit]\nWants=adaptive-bridge-standby-critical.service\n"), "{target}");
+    fn a_standby_has_what_the_service_has() {
+        let without = format!("{PLAIN}processes: {{ingress: {{standby: none}}}}\n");
+        let drop_ins = DropIns::of(&settings(&without), Path::new("/srv/bridge.yaml")).0;
         let [standby, critical] = [CRITICAL_STANDBY, &egress("critical")].map(|unit| &drop_ins[unit]);
         assert_eq!(standby, critical);
-        for line in ["Environment=", SEE_PROCESSES, "MemoryMax="] {
+        for line in ["Environment=", "MemoryMax="] {
             assert!(standby.contains(line), "{standby}");
         }
-        assert!(!drop_ins.contains_key(INGRESS_STANDBY) && !drop_ins[INGRESS].contains(SEE_PROCESSES));
+        assert!(!drop_ins.contains_key(INGRESS_STANDBY));
     }
 
     #[test]

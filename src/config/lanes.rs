@@ -27,6 +27,10 @@ const CRITICAL_SLICE_US: u32 = 100;
 /// lane's samples.
 const NONCRITICAL_SLICE_US: u32 = 10_000;
 
+/// The default of ingress and of the critical lane: a subscriber then waits for tens of milliseconds when the
+/// process ends, not for a start (docs/decisions/0027-warm-standby.md).
+pub(super) const CRITICAL_STANDBY: Standby = Standby::Warm;
+
 /// The samples of a route that may wait for a noncritical lane in shared memory. Fourteen static publishers
 /// are discovered at once, while the lane sleeps or creates its writer.
 const NONCRITICAL_QUEUE: usize = 16;
@@ -129,12 +133,18 @@ impl LaneReader<'_> {
 
 /// Only critical lanes may have a standby: other lanes keep no identity for it to continue.
 fn standby(field: &Field<'_>, class: TrafficClass) -> Standby {
-    let standby = field.choice_or_default();
-    if standby == Standby::Warm && class == TrafficClass::Noncritical {
-        field.report::<()>("must be none, because only the critical lane and ingress can have a standby");
-        return Standby::None;
+    let standby = field.choice();
+    match class {
+        TrafficClass::Critical => standby.unwrap_or(CRITICAL_STANDBY),
+        TrafficClass::Noncritical => {
+            if standby == Some(Standby::Warm) {
+                field.report::<()>(
+                    "must be none, because only the critical lane and ingress can have a standby",
+                );
+            }
+            Standby::None
+        }
     }
-    standby
 }
 
 /// The DSCP of what must arrive soon (RFC 3246). Wi-Fi sends it before the rest, in the queue for video.

@@ -219,7 +219,8 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
     let (routes, patterns, lanes) = routes::read(root, &profiles, &input, drafts, max_sample_bytes);
 
     let processes = root.section("processes");
-    let ingress_standby = processes.section("ingress").get("standby").choice_or_default();
+    let ingress_standby =
+        processes.section("ingress").get("standby").choice().unwrap_or(lanes::CRITICAL_STANDBY);
     let process = |name: &str, class| {
         let section = processes.section(name).section("scheduling");
         lanes::scheduling(&section, lanes::default_scheduling(class))

@@ -91,12 +91,11 @@ impl Active {
         let pid = Pid::from_raw(getsockopt(&connection, sockopt::PeerCredentials)?.pid());
         let stat = StatFile::open(pid.as_raw());
         if let Err(error) = &stat {
-            // systemd hides it without ProtectProc=default, which `units` writes.
             warn!(
                 %pid,
                 %error,
-                "standby: cannot see whether the active process is stopped, and will not kill it then; as a \
-                 service: run `adaptive-bridge units --write`"
+                "standby: cannot see whether the active process is stopped, and will not kill it then: it runs in \
+                 another container, or ProtectProc of its service hides it"
             );
         }
         Ok(Self { connection, pid, stat: stat.ok() })
@@ -128,6 +127,10 @@ impl Waiting {
             match RoleLock::acquire_standby(&root, instance, name) {
                 Ok(lock) => break lock,
                 Err(ShmError::AlreadyServed { .. }) if clock::monotonic() < give_up_at => {}
+                // Names the process that serves the role, not the one that waits for it.
+                Err(taken @ ShmError::AlreadyServed { .. }) => {
+                    return Err(RoleLock::acquire(&root, instance, name).err().unwrap_or(taken).into());
+                }
                 Err(error) => return Err(error.into()),
             }
             if stop.is_requested() {

@@ -298,8 +298,7 @@ fn a_bridge_whose_processes_were_killed_leaves_no_shared_memory() {
 
     // The next bridge of the same instance removes the files of the previous one, forwards, and leaves no
     // files when it ends.
-    bed.up = bed.bridge.start_on(bed.net.host("bridge"), "up");
-    bed.wait_up();
+    bed.start_up_again();
     let before = flow.critical.received();
     flow.critical.wait_received(before + 100);
     for child in ["ingress", "egress-critical", "egress-noncritical"] {
@@ -467,17 +466,18 @@ fn wait_ended(mut process: Process) -> (Option<i32>, String) {
 
 #[test]
 fn a_second_egress_of_a_lane_is_refused_and_names_the_first() {
+    // A second one of the critical lane would be its standby.
     let bridge = Bridge::new(&format!("instance: {{instance}}\nros: {{domain_id: 120}}\n{SCAN}"));
-    let mut first = bridge.start("egress --lane critical");
+    let mut first = bridge.start("egress --lane noncritical");
     first.wait_for_log("egress is up");
-    let (code, log) = wait_ended(bridge.start("egress --lane critical"));
+    let (code, log) = wait_ended(bridge.start("egress --lane noncritical"));
     assert_eq!(code, Some(1), "{log}");
-    assert!(log.contains("egress-critical") && log.contains(&first.pid().to_string()), "{log}");
+    assert!(log.contains("egress-noncritical") && log.contains(&first.pid().to_string()), "{log}");
     let (code, log) = wait_ended(bridge.start("egress --lane nosuch"));
     assert_eq!(code, Some(1), "{log}");
     assert!(log.contains("nosuch") && log.contains("critical, noncritical"), "{log}");
     first.kill9();
-    let mut again = bridge.start("egress --lane critical");
+    let mut again = bridge.start("egress --lane noncritical");
     again.wait_for_log("egress is up");
     assert!(again.terminate().success(), "{}", again.log());
 }

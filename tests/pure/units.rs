@@ -39,7 +39,6 @@ fn services_have_no_capabilities_and_write_only_to_shared_memory() {
         "PrivateTmp=yes",
         "ProtectSystem=strict",
         "ProtectHome=yes",
-        "ProtectProc=invisible",
         "RemoveIPC=no",
         "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK",
         "SystemCallFilter=@system-service",
@@ -58,6 +57,16 @@ fn services_have_no_capabilities_and_write_only_to_shared_memory() {
                 "{unit} replaces {setting}"
             );
         }
+    }
+}
+
+/// A standby sees whether the process that it would take over from is stopped or makes progress.
+#[test]
+fn only_ingress_the_critical_lane_and_their_standbys_see_all_processes() {
+    for unit in CRITICAL.into_iter().chain(OTHERS).filter(|unit| *unit != COMMON) {
+        // A drop-in overrides the service, so that of the critical lane has to say so.
+        let expected = if CRITICAL.contains(&unit) { "default" } else { "invisible" };
+        assert!(settings(unit).contains(&format!("ProtectProc={expected}")), "{unit}");
     }
 }
 

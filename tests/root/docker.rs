@@ -15,7 +15,14 @@ use support::process::signal;
 const BOOTSTRAPPED: &str = "adaptive-bridge-test-base";
 const BOOTSTRAPPED_RUST: &str = "adaptive-bridge-test-rust";
 
-const CONTAINERS: [&str; 4] = ["ingress", "egress-critical", "egress-noncritical", "control"];
+const CONTAINERS: [&str; 6] = [
+    "ingress",
+    "egress-critical",
+    "egress-noncritical",
+    "control",
+    "standby-ingress",
+    "standby-critical",
+];
 
 fn run(command: &mut Command) -> String {
     let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));

@@ -7,7 +7,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
-use support::bed::{CRITICAL, INPUT, NONCRITICAL, SCAN, STANDBYS as WITH_STANDBYS};
+use support::bed::{CRITICAL, INPUT, NONCRITICAL, SCAN};
 use support::machine::{Machine, install, machine_missing};
 use support::netns::{Host, Net};
 use support::peer::{Peer, Received, RunningPeer, Sent};
@@ -21,6 +21,8 @@ const CONTROL: &str = "adaptive-bridge-control.service";
 const UNITS: [&str; 4] = [INGRESS, EGRESS_CRITICAL, EGRESS_NONCRITICAL, CONTROL];
 const STANDBYS: [&str; 2] =
     ["adaptive-bridge-standby-ingress.service", "adaptive-bridge-standby-critical.service"];
+/// The keys without which ingress and the critical lane have standbys.
+const NO_STANDBYS: &str = "lanes: {critical: {standby: none}}\nprocesses: {ingress: {standby: none}}\n";
 const RESPONDER: &str = "adaptive-bridge-responder@laptop.service";
 
 const CONFIG: &str = "/etc/adaptive-bridge/config.yaml";
@@ -68,7 +70,7 @@ impl Bed {
     /// Stops the bridge and waits until every process has ended.
     fn stop(&self) {
         self.machine.run(&["systemctl", "stop", TARGET]);
-        for unit in UNITS {
+        for unit in UNITS.into_iter().chain(STANDBYS) {
             self.machine.wait_property(unit, "ActiveState", "inactive");
             assert_eq!(self.machine.property(unit, "Result"), "success", "{unit}");
         }
@@ -170,8 +172,12 @@ fn the_units_are_sound_and_hardened() {
 #[test]
 fn a_killed_or_stopped_unit_is_restarted_and_delays_no_other() {
     let test = "a_killed_or_stopped_unit_is_restarted_and_delays_no_other";
-    let Some(bed) = Bed::boot(test, SCAN) else { return };
+    let Some(bed) = Bed::boot(test, &format!("{SCAN}{NO_STANDBYS}")) else { return };
     bed.start();
+    for standby in STANDBYS {
+        bed.machine.wait_property(standby, "ActiveState", "inactive");
+        assert_eq!(bed.machine.property(standby, "Result"), "success", "{standby}");
+    }
     bed.machine.run(&["systemctl", "start", RESPONDER]);
     let flow = bed.flow();
     for unit in UNITS.into_iter().chain([RESPONDER]) {
@@ -214,9 +220,7 @@ fn a_killed_or_stopped_unit_is_restarted_and_delays_no_other() {
 #[test]
 fn a_standby_takes_over_from_a_killed_stopped_or_restarted_unit() {
     let test = "a_standby_takes_over_from_a_killed_stopped_or_restarted_unit";
-    let Some(bed) = Bed::boot(test, &format!("{SCAN}{WITH_STANDBYS}")) else { return };
-    bed.machine.run(&["adaptive-bridge", "units", "--write"]);
-    bed.machine.run(&["systemctl", "daemon-reload"]);
+    let Some(bed) = Bed::boot(test, SCAN) else { return };
     bed.start();
     for standby in STANDBYS {
         bed.machine.wait_property(standby, "ActiveState", "active");
@@ -300,7 +304,7 @@ fn a_restart_of_the_target_applies_the_edited_file_and_that_of_a_service_does_no
 #[test]
 fn systemd_restarts_a_process_in_which_any_thread_hangs_or_ends() {
     let test = "systemd_restarts_a_process_in_which_any_thread_hangs_or_ends";
-    let Some(bed) = Bed::boot(test, SCAN) else { return };
+    let Some(bed) = Bed::boot(test, &format!("{SCAN}{NO_STANDBYS}")) else { return };
     bed.start();
     let flow = bed.flow();
     std::thread::scope(|scope| {
@@ -435,7 +439,9 @@ fn a_process_that_finds_shared_memory_full_waits_for_room_and_the_others_go_on()
     let log = bed.machine.run(&["journalctl", "--unit", INGRESS]);
     assert!(log.contains("/dev/shm"), "{log}");
     bed.machine.run(&["mount", "-o", "remount,size=64M", "/dev/shm"]);
-    bed.machine.wait_property(INGRESS, "ActiveState", "active");
+    for unit in [INGRESS, STANDBYS[0]] {
+        bed.machine.wait_property(unit, "ActiveState", "active");
+    }
     let flow = bed.flow();
     flow.end();
     bed.stop();
@@ -526,7 +532,7 @@ fn systemd_shows_the_state_of_the_bridge_and_stop_leaves_no_files() {
     let up = [["systemd-run"].as_slice(), &up, &["adaptive-bridge", "up"]].concat();
     // `systemd-run` returns when the service has reported that it is ready.
     bed.machine.run(&up);
-    says("whole.service", "4 of 4 processes; in scan 0.0/s; out critical (normal) 0.0/s");
+    says("whole.service", "6 of 6 processes; in scan 0.0/s; out critical (normal) 0.0/s");
     bed.machine.run(&["systemctl", "stop", "whole.service"]);
     let left = || bed.machine.run(&["sh", "-c", "ls /dev/shm /run/adaptive-bridge"]);
     assert!(!left().contains("ab1_") && !left().contains("default"), "{}", left());
@@ -694,6 +700,7 @@ fn the_package_installs_upgrades_while_samples_flow_and_leaves_nothing() {
         assert_eq!(set.trim(), value, "{path}: a limit that is too low is raised, and none is lowered");
     }
     assert_eq!(bed.machine.property(TARGET, "ActiveState"), "inactive");
+    bed.machine.write(CONFIG, &format!("{SCAN}{NO_STANDBYS}"));
     bed.machine.run(&["systemctl", "enable", "--now", TARGET]);
     bed.start();
     let flow = bed.flow();
@@ -708,9 +715,7 @@ fn the_package_installs_upgrades_while_samples_flow_and_leaves_nothing() {
     flow.end();
 
     // With standbys no subscriber notices an upgrade; the way back to the former package is one, too.
-    bed.machine.write(CONFIG, &format!("{SCAN}{WITH_STANDBYS}"));
-    bed.machine.run(&["adaptive-bridge", "units", "--write"]);
-    bed.machine.run(&["systemctl", "daemon-reload"]);
+    bed.machine.write(CONFIG, SCAN);
     bed.machine.run(&["systemctl", "restart", TARGET]);
     let flow = bed.flow();
     let units = [&UNITS[..], &STANDBYS].concat();

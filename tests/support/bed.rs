@@ -13,8 +13,11 @@ use super::process::Process;
 /// start.
 pub const SCAN: &str = "topics:\n  - {id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, \
                         max_sample_bytes: 65536}\n";
-/// The keys with which ingress and the critical lane have standbys.
+/// The keys with which ingress and the critical lane have standbys in a bed.
 pub const STANDBYS: &str = "lanes: {critical: {standby: warm}}\nprocesses: {ingress: {standby: warm}}\n";
+/// The options of `up` with which they have none.
+const NO_STANDBYS: &str =
+    " --parameter lanes.critical.standby:=none --parameter processes.ingress.standby:=none";
 /// The DDS type of the route.
 pub const SCAN_TYPE: &str = "sensor_msgs::msg::dds_::LaserScan_";
 /// The DDS topic of the route's input.
@@ -32,8 +35,9 @@ pub struct Bed {
 }
 
 impl Bed {
-    /// Starts a bridge with the configuration `yaml`, to which the instance name is added. Returns `None` and
-    /// records that `test` is skipped if the machine lacks the requirements.
+    /// Starts a bridge with the configuration `yaml`, to which the instance name is added, without standbys
+    /// unless `yaml` has them: most tests are about what a restart does. Returns `None` and records that
+    /// `test` is skipped if the machine lacks the requirements.
     pub fn start(test: &str, yaml: &str) -> Option<Self> {
         Self::start_with(test, yaml, &[])
     }
@@ -55,10 +59,17 @@ impl Bed {
         }
         let net = Net::new(&[&["publisher", "bridge", "critical", "slow"], more].concat());
         let bridge = Bridge::new(&format!("instance: {{instance}}\n{yaml}"));
-        let up = bridge.start_on(net.host("bridge"), up);
+        let standbys = if yaml.contains("standby: warm") { "" } else { NO_STANDBYS };
+        let up = bridge.start_on(net.host("bridge"), &format!("{up}{standbys}"));
         let bed = Self { up, bridge, net };
         bed.wait_up();
         Some(bed)
+    }
+
+    /// Starts `up`, which has ended, without standbys, and waits until its processes are up.
+    pub fn start_up_again(&mut self) {
+        self.up = self.bridge.start_on(self.net.host("bridge"), &format!("up{NO_STANDBYS}"));
+        self.wait_up();
     }
 
     /// Waits until ingress and the two default lanes are up.

@@ -150,7 +150,8 @@ impl Drop for Bridge {
     }
 }
 
-/// The bridge's configuration for the routes and remote subscribers of a scenario, with default settings.
+/// The bridge's configuration for the routes and remote subscribers of a scenario, with default settings, but
+/// for standbys: the CPU time of a role is that of one process, and no process of a scenario ends.
 fn configuration(scenario: &Scenario) -> String {
     let workload = &scenario.workload;
     let mut yaml = format!("instance: {}\nros: {{domain_id: 0}}\ntopics:\n", stale::instance());
@@ -167,7 +168,8 @@ fn configuration(scenario: &Scenario) -> String {
     let noncritical = scenario.lanes().into_iter().filter(|lane| lane != "critical");
     let noncritical: Vec<String> =
         noncritical.map(|lane| format!("{lane}: {{qos: {{reliability: BEST_EFFORT}}}}")).collect();
-    let _ = writeln!(yaml, "lanes: {{{}}}", noncritical.join(", "));
+    let _ = writeln!(yaml, "lanes: {{critical: {{standby: none}}, {}}}", noncritical.join(", "));
+    let _ = writeln!(yaml, "processes: {{ingress: {{standby: none}}}}");
     let remotes = scenario.remotes.iter();
     let remotes: Vec<String> =
         remotes.map(|remote| format!("{}: {{lane: {}}}", remote.name, remote.lane)).collect();
