@@ -37,7 +37,7 @@ def scheduling(cpu):
 class Build:
     """A running bridge of one build."""
 
-    def __init__(self, name, program, domain, folder, cpus):
+    def __init__(self, name, program, domain, folder, cpus, standby):
         self.name, self.domain = name, domain
         config = folder / f"{name}.yaml"
         config.write_text(
@@ -45,8 +45,8 @@ class Build:
             "topics: [{id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, "
             "max_sample_bytes: 8388608}]\n"
             f"shared_memory: {{root_path: {folder}/{name}}}\n"
-            f"lanes: {{critical: {{queue_depth: 512, {scheduling(cpus[1])}}}}}\n"
-            f"processes: {{ingress: {{{scheduling(cpus[0])}}}}}\nclassifier: {{enabled: false}}\n")
+            f"lanes: {{critical: {{queue_depth: 512, {scheduling(cpus[1])}{standby}}}}}\n"
+            f"processes: {{ingress: {{{scheduling(cpus[0])}{standby}}}}}\nclassifier: {{enabled: false}}\n")
         environment = {**os.environ, "RUST_LOG": "info", "NO_COLOR": "1"}
         self.log = folder / f"{name}.log"
         with open(self.log, "w") as log:
@@ -58,11 +58,12 @@ class Build:
                 sys.exit(f"{program} did not start within 30 s:\n{self.log.read_text()}")
             time.sleep(0.1)
         started = [line for line in self.log.read_text().splitlines() if "started child=" in line]
-        critical_path = [line for line in started if '"ingress"' in line or '"egress-critical"' in line]
+        # With their standbys, ingress-2 and egress-critical-2.
+        critical_path = [line for line in started if '"ingress' in line or '"egress-critical' in line]
         self.pids = [int(line.split("pid=")[1].split()[0]) for line in critical_path]
 
     def cpu_s(self):
-        """CPU time of all threads of ingress and the critical lane so far."""
+        """CPU time of all threads of ingress, the critical lane and their standbys so far."""
         tasks = [task for pid in self.pids for task in Path(f"/proc/{pid}/task").iterdir()]
         return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e9
 
@@ -143,6 +144,8 @@ def main():
                         help="give ingress and the critical lane a CPU each")
     parser.add_argument("--peer-cpus", type=int, nargs=2, default=(None, None), metavar=("PUBLISHER", "SUBSCRIBER"),
                         help="run the programs on these CPUs; with --cpus the rounds differ less")
+    parser.add_argument("--standbys", choices=("none", "warm"), nargs=2, metavar=("OLD", "NEW"),
+                        help="whether ingress and the critical lane have standbys; default: as the build has it")
     parser.add_argument("--json", help="also write every round to this file")
     options = parser.parse_args()
     program = PEERS / f"{options.peers}_peer"
@@ -150,9 +153,11 @@ def main():
         sys.exit(f"{program} is not built: run `make peers`")
     rounds = {}
     with tempfile.TemporaryDirectory() as folder:
+        standbys = [f", standby: {standby}" for standby in options.standbys or ()] or ["", ""]
         builds = [
-            Build(name, program, domain, Path(folder), options.cpus)
-            for name, program, domain in (("old", options.old, 61), ("new", options.new, 62))]
+            Build(name, executable, domain, Path(folder), options.cpus, standby)
+            for name, executable, domain, standby in (
+                ("old", options.old, 61, standbys[0]), ("new", options.new, 62, standbys[1]))]
         try:
             for case in options.case or CASES:
                 rate_hz, size = CASES[case]
