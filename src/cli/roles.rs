@@ -27,7 +27,8 @@ pub(super) struct EgressArguments {
 #[derive(Args, Debug)]
 pub(super) struct UpArguments {
     /// Leave processes alone that make no progress, for example because a debugger has stopped them;
-    /// otherwise they are killed and restarted after 2 s (ingress, critical lane) or 5 s
+    /// otherwise they are killed and restarted after 2 s (ingress, critical lane; by their standby after
+    /// 0.5 s) or 5 s
     #[arg(long)]
     no_watchdog: bool,
     #[command(flatten)]
@@ -55,10 +56,15 @@ pub(super) fn ingress(arguments: &ConfigArguments) -> Result<ExitCode, ExitCode>
     Ok(ends_with.map_or(code, ExitCode::from))
 }
 
+/// Whether this is the service of a standby.
+fn is_standby() -> bool {
+    std::env::var_os(STANDBY_VARIABLE).is_some()
+}
+
 /// Ends the service of a standby that the configuration does not have any more: the other process of the role
 /// serves it alone.
 fn ends_standby(standby: Standby, role: &str) -> bool {
-    let ends = standby == Standby::None && std::env::var_os(STANDBY_VARIABLE).is_some();
+    let ends = standby == Standby::None && is_standby();
     if ends {
         process::end_standby(role);
     }
@@ -121,8 +127,11 @@ fn role(
     let reloads = ReloadRequests::on_signal(move |set| reload_arguments.try_load_with(set))
         .map_err(|error| failed(&error))?;
     process::end_with_supervisor();
-    let in_force = match InForce::join(&arguments.file(), |set| arguments.try_load_with(set)) {
+    let (file, load) = (arguments.file(), |set: &SetParameters| arguments.try_load_with(set));
+    let joined = if is_standby() { InForce::wait(&file, load) } else { InForce::join(&file, load) };
+    let in_force = match joined {
         Ok(in_force) => in_force,
+        Err(error @ InForceError::NoBridge { .. }) => return run(|_| Err(error)),
         Err(InForceError::Config(error)) => return Err(bad_configuration(&error)),
         Err(InForceError::Shm(error)) => return run(|_| Err(error)),
     };

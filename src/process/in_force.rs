@@ -2,10 +2,12 @@
 //! starts while the bridge runs uses it, even if the configuration file has changed since.
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use tracing::{info, warn};
 
 use super::parameter_store::read_parameters;
+use crate::clock;
 use crate::config::{ConfigError, Configuration, SetParameters, Settings};
 use crate::model::InstanceName;
 use crate::shm::{BridgeAddress, InForceFile, InForceShare, ShmError, default_root, root_of};
@@ -13,6 +15,11 @@ use crate::telemetry::Snapshot;
 
 /// Environment variable that `up` sets for its children, to the folder of their instance.
 pub(super) const FOLDER_VARIABLE: &str = "ADAPTIVE_BRIDGE_FOLDER";
+
+/// How long the service of a standby waits for a bridge. systemd starts all services at once, and gives each
+/// 30 s.
+const BRIDGE_WITHIN_MS: u64 = 20_000;
+const BRIDGE_POLL: Duration = Duration::from_millis(50);
 
 /// The configuration that this process uses, and its share in the file that keeps it in force.
 #[derive(Debug)]
@@ -30,6 +37,15 @@ pub enum InForceError {
     /// The folder of the instance cannot be used.
     #[error(transparent)]
     Shm(#[from] ShmError),
+    /// A standby found no bridge to wait in.
+    #[error(
+        "standby: no bridge runs with {}; if the services that it is to take over from have drop-ins of their own, \
+         give it the same ones (adaptive-bridge units --write)", file.display()
+    )]
+    NoBridge {
+        /// The configuration file that the standby was started with.
+        file: PathBuf,
+    },
 }
 
 impl InForce {
@@ -42,12 +58,8 @@ impl InForce {
         file: &Path,
         load: impl Fn(&SetParameters) -> Result<Configuration, ConfigError>,
     ) -> Result<Self, InForceError> {
-        let by_file = || BridgeAddress::find(&own_root(), file).map(|found| (found.root, found.instance));
-        let address = supervised_folder().or_else(by_file);
-        if let Some((root, instance)) = address
-            && let Some((share, bytes)) = InForceShare::join_running(&root, &instance)?
-        {
-            return Self::of_running_bridge(share, &bytes, load);
+        if let Some(joined) = Self::join_running(file, &load)? {
+            return Ok(joined);
         }
         let configuration = load(&SetParameters::new())?;
         let (root, instance) = (root_of(&configuration.settings), configuration.settings.instance.clone());
@@ -58,6 +70,41 @@ impl InForce {
         }
         write_address(file, &root, &instance);
         Ok(Self { configuration, share })
+    }
+
+    /// The configuration in force of the bridge that was started with `file`; `None` if it does not run.
+    fn join_running(
+        file: &Path,
+        load: impl Fn(&SetParameters) -> Result<Configuration, ConfigError>,
+    ) -> Result<Option<Self>, InForceError> {
+        let by_file = || BridgeAddress::find(&own_root(), file).map(|found| (found.root, found.instance));
+        let Some((root, instance)) = supervised_folder().or_else(by_file) else { return Ok(None) };
+        let Some((share, bytes)) = InForceShare::join_running(&root, &instance)? else { return Ok(None) };
+        Self::of_running_bridge(share, &bytes, load).map(Some)
+    }
+
+    /// Like [`join`](Self::join), for the service of a standby: waits for a bridge and begins none. With
+    /// another file than the service that it is to take over from, that would be a second bridge.
+    ///
+    /// # Errors
+    /// No bridge runs with `file` within 20 s, the file is bad, or the folder of the instance cannot be used.
+    pub fn wait(
+        file: &Path,
+        load: impl Fn(&SetParameters) -> Result<Configuration, ConfigError>,
+    ) -> Result<Self, InForceError> {
+        let give_up_at = clock::monotonic().plus_ms(BRIDGE_WITHIN_MS);
+        loop {
+            if let Some(joined) = Self::join_running(file, &load)? {
+                return Ok(joined);
+            }
+            // With a bad file no other process begins a bridge either.
+            load(&SetParameters::new())?;
+            if clock::monotonic() >= give_up_at {
+                return Err(InForceError::NoBridge { file: file.to_owned() });
+            }
+            #[allow(clippy::disallowed_methods, reason = "a process that starts handles no samples")]
+            std::thread::sleep(BRIDGE_POLL);
+        }
     }
 
     /// Puts a configuration in force for a bridge whose processes are all started together (`up`).

@@ -8,12 +8,13 @@ use serde_json::Value;
 use support::bridge::{Bridge, program};
 use support::process::{Process, signal};
 
-/// `shared_memory` are more of its keys.
+/// A bridge without standbys. `shared_memory` are more of its keys.
 fn bridge(domain_id: u16, shared_memory: &str) -> Bridge {
     Bridge::new(&format!(
         "instance: {{instance}}\nros: {{domain_id: {domain_id}}}\n\
          topics:\n  - {{id: scan, input_topic: /scan, max_sample_bytes: 8192}}\n\
-         shared_memory: {{root_path: {{folder}}/root{shared_memory}}}\n"
+         shared_memory: {{root_path: {{folder}}/root{shared_memory}}}\n\
+         lanes: {{critical: {{standby: none}}}}\nprocesses: {{ingress: {{standby: none}}}}\n"
     ))
 }
 
@@ -58,10 +59,12 @@ fn a_budget_with_which_ingress_cannot_start_is_a_bad_configuration() {
     }
 }
 
-/// systemd starts the service of a standby until the target is started anew.
+/// The target starts the services of the standbys with any configuration.
 #[test]
 fn the_service_of_a_standby_ends_if_the_configuration_has_none() {
     let bridge = bridge(118, "");
+    let _up = bridge.start("up");
+    bridge.wait_status("all processes", are_running);
     for role in [&["ingress"][..], &["egress", "--lane", "critical"]] {
         let mut command = Command::new(program());
         command.args(role).arg("--config").arg(bridge.config()).env("ADAPTIVE_BRIDGE_STANDBY", "1");
@@ -70,4 +73,19 @@ fn the_service_of_a_standby_ends_if_the_configuration_has_none() {
         assert_eq!(output.status.code(), Some(3), "{role:?}: {stderr}");
         assert!(stderr.contains("no standby for this role"), "{stderr}");
     }
+}
+
+/// One that read another file than the other services would be a second bridge beside theirs.
+#[test]
+fn the_service_of_a_standby_begins_no_bridge() {
+    let bridge = bridge(119, "");
+    let mut command = Command::new(program());
+    command.args(["ingress", "--config"]).arg(bridge.config()).env("ADAPTIVE_BRIDGE_STANDBY", "1");
+    let output = command.output().unwrap();
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    assert!(stderr.contains("no bridge runs with") && stderr.contains("units --write"), "{stderr}");
+
+    fs::write(bridge.config(), "topics: nonsense\n").unwrap();
+    assert_eq!(command.output().unwrap().status.code(), Some(78));
 }
