@@ -309,9 +309,27 @@ fn listen_at(path: &Path) -> io::Result<UnixListener> {
         _ => {}
     }
     let listener = open_socket()?;
-    bind(listener.as_raw_fd(), &UnixAddr::new(path)?)?;
+    bind(listener.as_raw_fd(), &Address::of(path)?.address)?;
     listen(&listener, Backlog::new(1)?)?;
     Ok(listener.into())
+}
+
+/// The address of a socket whose path may be longer than an address (107 bytes).
+struct Address {
+    address: UnixAddr,
+    /// The address is relative to it.
+    _folder: fs::File,
+}
+
+impl Address {
+    fn of(path: &Path) -> io::Result<Self> {
+        let (Some(folder), Some(name)) = (path.parent(), path.file_name()) else {
+            return Err(ErrorKind::InvalidInput.into());
+        };
+        let folder = fs::File::open(folder)?;
+        let path = Path::new("/proc/self/fd").join(folder.as_raw_fd().to_string()).join(name);
+        Ok(Self { address: UnixAddr::new(&path)?, _folder: folder })
+    }
 }
 
 /// A socket that keeps the bounds of messages, and never blocks.
@@ -334,6 +352,7 @@ pub(super) enum Leave {
 /// Sends the sockets of this process to its standby, as soon as there is one.
 pub(super) struct Successor {
     path: PathBuf,
+    address: Option<Address>,
     sockets: Vec<UdpSocket>,
     connection: Option<OwnedFd>,
     /// From when on the process may hand over; `None` if it was not asked to end.
@@ -343,7 +362,7 @@ pub(super) struct Successor {
 impl Successor {
     /// `path` is the socket of the standby.
     pub fn new(path: PathBuf, sockets: Vec<UdpSocket>) -> Self {
-        Self { path, sockets, connection: None, leave_at: None }
+        Self { path, address: None, sockets, connection: None, leave_at: None }
     }
 
     /// How the process ends now that it was asked to.
@@ -379,9 +398,14 @@ impl Successor {
         }
     }
 
-    fn connect(&self) -> io::Result<OwnedFd> {
+    fn connect(&mut self) -> io::Result<OwnedFd> {
+        // Once, because housekeeping allocates nothing.
+        let address = match &self.address {
+            Some(address) => address,
+            None => self.address.insert(Address::of(&self.path)?),
+        };
         let connection = open_socket()?;
-        connect(connection.as_raw_fd(), &UnixAddr::new(&self.path)?)?;
+        connect(connection.as_raw_fd(), &address.address)?;
         kept_sockets::hand_over(connection.as_fd(), &self.sockets)?;
         Ok(connection)
     }
@@ -419,7 +443,10 @@ mod tests {
     #[test]
     fn a_process_hands_over_to_a_standby_that_does_not_end_as_well() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("standby");
+        // Longer than the address of a socket.
+        let folder = folder.path().join("f".repeat(200));
+        fs::create_dir(&folder).unwrap();
+        let path = folder.join("standby");
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
         let mut active = Successor::new(path.clone(), vec![socket]);
         active.housekeeping();
