@@ -159,7 +159,8 @@ impl Waiting {
         }))
     }
 
-    /// Waits until the role is free, and takes it; `None` if `stop` was requested meanwhile.
+    /// Waits until the role is free, and takes it; `None` if `stop` was requested meanwhile. If the active
+    /// process has handed over just before, it takes the role all the same, to say goodbye.
     pub fn wait(
         &mut self,
         settings: &Settings,
@@ -170,7 +171,8 @@ impl Waiting {
         notifier.ready();
         let mut free_since = None;
         let mut report_at = MonotonicNs(0);
-        while !stop.is_requested() {
+        loop {
+            let is_stopping = stop.is_requested();
             let now = clock::monotonic();
             if now >= report_at {
                 report_at = now.plus_ms(POLL_MS.into());
@@ -180,6 +182,11 @@ impl Waiting {
             }
             let was_connected = self.active.is_some();
             self.receive()?;
+            let is_heir = self.cause == TakeOverCause::HandedOver
+                || (self.active.is_none() && !self.sockets.is_empty());
+            if is_stopping && !is_heir {
+                break;
+            }
             if self.active.is_some() {
                 self.fence(name);
                 continue;
@@ -187,6 +194,9 @@ impl Waiting {
             self.ended_at = clock::monotonic();
             let try_until = if was_connected { self.ended_at.plus_ms(END_MS) } else { self.ended_at };
             let Some(lock) = self.take(settings, name, try_until)? else {
+                if is_stopping {
+                    break;
+                }
                 free_since = None;
                 continue;
             };
