@@ -28,10 +28,10 @@ use super::notify::Notifier;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::Settings;
-use crate::model::{MonotonicNs, StandbyRecord, TakeOverCause};
-use crate::policy::{may_fence, take_overs_in_a_row};
+use crate::model::{MonotonicNs, ProcessHealth, StandbyRecord, TakeOverCause};
+use crate::policy::{HangWatch, hang_limit_ms, may_fence, take_overs_in_a_row};
 use crate::shm::{BoardWriter, Boards, ProcessRole, RoleLock, ShmError, root_of};
-use crate::telemetry::StatFile;
+use crate::telemetry::{Starvation, StatFile};
 
 /// How often a standby checks for a request to stop, and whether the role is free although no connection told
 /// it.
@@ -39,6 +39,13 @@ const POLL_MS: u16 = 50;
 
 /// How often a standby checks whether the active process is stopped, which takes some 50 µs of CPU time.
 const STOPPED_POLL_MS: u16 = 12;
+
+/// How often a standby checks whether the active process makes progress.
+const PROGRESS_POLL_MS: u64 = 50;
+
+/// The time without a turn after which the standby looks whether other programs keep the active process from
+/// it, which takes some 0.1 ms of CPU time: longer than the 100 ms between two turns without samples.
+const STALL_MS: u64 = 110;
 
 /// Environment variable of the children of an `up` that leaves processes alone which make no progress.
 pub(super) const NO_WATCHDOG_VARIABLE: &str = "ADAPTIVE_BRIDGE_NO_WATCHDOG";
@@ -64,6 +71,9 @@ pub(super) struct Waiting {
     /// Its right to wait, which also lets it write the board.
     lock: RoleLock,
     board: BoardWriter<StandbyRecord>,
+    role: ProcessRole,
+    boards: Boards,
+    routes: usize,
     listener: UnixListener,
     active: Option<Active>,
     /// The sockets of the active process.
@@ -73,7 +83,7 @@ pub(super) struct Waiting {
     /// Why the active process ends, or has ended.
     cause: TakeOverCause,
     ended_at: MonotonicNs,
-    /// Whether it kills an active process that is stopped.
+    /// Whether it kills an active process that is stopped or hangs.
     fences: bool,
 }
 
@@ -83,6 +93,35 @@ struct Active {
     pid: Pid,
     /// `None` where this process cannot see it.
     stat: Option<StatFile>,
+    progress: Progress,
+}
+
+/// The turns of the active process.
+struct Progress {
+    check_at: MonotonicNs,
+    /// From its first turn on: a start takes longer.
+    watch: Option<HangWatch>,
+    starvation: Starvation,
+}
+
+impl Progress {
+    const fn new() -> Self {
+        let starvation = Starvation::new(PROGRESS_POLL_MS);
+        Self { check_at: MonotonicNs(0), watch: None, starvation }
+    }
+
+    /// Whether the process with this id and health has made no progress for the limit.
+    fn has_hung(&mut self, pid: u64, health: &ProcessHealth, limit_ms: u64, now: MonotonicNs) -> bool {
+        if now < self.check_at || health.pid != pid || health.turns == 0 {
+            return false;
+        }
+        self.check_at = now.plus_ms(PROGRESS_POLL_MS);
+        let watch = self.watch.get_or_insert_with(|| HangWatch::new(limit_ms, now));
+        watch.set_limit_ms(limit_ms);
+        let is_stalled = now.since(health.alive_at) >= STALL_MS * 1_000_000;
+        let starved = is_stalled && self.starvation.check(pid, now);
+        watch.has_hung(health.alive_at, starved, now)
+    }
 }
 
 impl Active {
@@ -98,7 +137,21 @@ impl Active {
                  another container, or ProtectProc of its service hides it"
             );
         }
-        Ok(Self { connection, pid, stat: stat.ok() })
+        Ok(Self { connection, pid, stat: stat.ok(), progress: Progress::new() })
+    }
+
+    /// Why it is to be killed, with its `health` and the `limit_ms` of its progress.
+    fn fault(
+        &mut self,
+        health: Option<ProcessHealth>,
+        limit_ms: u64,
+        now: MonotonicNs,
+    ) -> Option<TakeOverCause> {
+        if self.stat.as_ref()?.is_stopped() {
+            return Some(TakeOverCause::Stopped);
+        }
+        let pid = u64::try_from(self.pid.as_raw()).ok()?;
+        self.progress.has_hung(pid, &health?, limit_ms, now).then_some(TakeOverCause::Hung)
     }
 }
 
@@ -149,6 +202,9 @@ impl Waiting {
         Ok(Some(Self {
             lock,
             board,
+            role,
+            boards: boards.clone(),
+            routes: settings.routes.len(),
             listener,
             active: None,
             sockets: Vec::new(),
@@ -245,18 +301,28 @@ impl Waiting {
         Ok(())
     }
 
-    /// Kills the active process if a signal has stopped it: continued later, it would be a second speaker
-    /// with the same identity.
+    /// Kills the active process if a signal has stopped it or if it makes no progress: continued later, it
+    /// would be a second speaker with the same identity.
     fn fence(&mut self, name: &str) {
-        let Some(active) = &self.active else { return };
-        let is_stopped = active.stat.as_ref().is_some_and(StatFile::is_stopped);
-        let may_fence = || may_fence(self.board.get().taken_over_at, clock::monotonic());
-        if !self.fences || !is_stopped || !may_fence() {
+        let Some(active) = &mut self.active else { return };
+        let (now, record) = (clock::monotonic(), self.board.get());
+        let limit_ms = hang_limit_ms(record, self.routes, now);
+        let health = self.boards.health(self.role);
+        let Some(cause) = active.fault(health, limit_ms, now).filter(|_| self.fences) else { return };
+        if !may_fence(record.taken_over_at, now) {
             return;
         }
-        warn!(role = name, pid = active.pid.as_raw(), "standby: kills the active process, which is stopped");
+        let pid = active.pid.as_raw();
+        match cause {
+            TakeOverCause::Hung => {
+                warn!(role = name, pid, "standby: kills the active process: no progress for {limit_ms} ms");
+            }
+            _ => warn!(role = name, pid, "standby: kills the active process, which is stopped"),
+        }
         match kill(active.pid, Signal::SIGKILL) {
-            Ok(()) => self.cause = TakeOverCause::Stopped,
+            // One that was asked to end, and takes long to do so, has handed over.
+            Ok(()) if self.cause == TakeOverCause::HandedOver => {}
+            Ok(()) => self.cause = cause,
             Err(error) => warn!(role = name, %error, "standby: cannot kill the active process"),
         }
     }

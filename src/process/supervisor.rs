@@ -30,7 +30,7 @@ use crate::config::{Configuration, Settings, Standby};
 use crate::model::{MonotonicNs, TrafficClass};
 use crate::policy::{ChildExit, GiveUpReason, HangWatch, RestartBackoff, RestartDecision};
 use crate::shm::{RoleLock, ShmError, root_of};
-use crate::telemetry::{ProcessReading, Snapshot, Threads};
+use crate::telemetry::{ProcessReading, Snapshot, Starvation};
 
 /// Interval at which the supervisor checks for requests, and its children if no signal tells that one ended.
 const POLL_MS: u64 = 20;
@@ -353,8 +353,7 @@ struct Supervised {
     hang_ms: u64,
     hang_watch: HangWatch,
     start_watch: HangWatch,
-    /// Its threads at the last check, and when that was.
-    threads: Option<(Threads, MonotonicNs)>,
+    starvation: Starvation,
     /// The sockets that its next process inherits.
     sockets: Option<SocketStore>,
 }
@@ -376,7 +375,7 @@ impl Supervised {
             hang_ms,
             hang_watch: HangWatch::new(hang_ms, now),
             start_watch: HangWatch::new(START_MS, now),
-            threads: None,
+            starvation: Starvation::new(READ_BOARDS_MS),
             sockets: None,
         }
     }
@@ -419,7 +418,7 @@ impl Supervised {
         let now = clock::monotonic();
         self.hang_watch = HangWatch::new(self.hang_ms, now);
         self.start_watch = HangWatch::new(START_MS, now);
-        self.threads = None;
+        self.starvation = Starvation::new(READ_BOARDS_MS);
         Ok(())
     }
 
@@ -473,17 +472,9 @@ impl Supervised {
         }
     }
 
-    /// Whether a thread of the child is ready to run, and the child got less than half of one CPU since the
-    /// last check: the machine is busy with other programs.
+    /// Whether other programs keep the child from making progress.
     fn is_starved(&mut self, now: MonotonicNs) -> bool {
-        let Some(pid) = self.pid() else { return false };
-        let threads = Threads::of(pid);
-        let last = self.threads.replace((threads, now));
-        // A check that is older than two intervals belongs to an earlier stall.
-        last.filter(|(_, at)| now.since(*at) < 2 * READ_BOARDS_MS * 1_000_000).is_some_and(|(last, at)| {
-            let cpu_ns = threads.cpu_ns.saturating_sub(last.cpu_ns);
-            last.ready && threads.ready && cpu_ns < now.since(at) / 2
-        })
+        self.pid().is_some_and(|pid| self.starvation.check(pid, now))
     }
 
     /// Kills the child if it runs and has not completed its first turn for too long.

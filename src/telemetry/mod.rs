@@ -31,7 +31,7 @@ pub use snapshot::{
     LaneReading, OutputReading, PatternReading, ProcessReading, RouteReading, Snapshot, SubscriberReading,
 };
 pub use text::{bytes_text, shortened, wrapped};
-pub use threads::Threads;
+pub use threads::Starvation;
 
 impl Snapshot {
     /// The report of this snapshot, with rates and latencies since `earlier`. A bridge that was restarted in

@@ -314,6 +314,7 @@ fn take_over_cause(cause: TakeOverCause) -> &'static str {
     match cause {
         TakeOverCause::Ended => ", as the former process ended",
         TakeOverCause::Stopped => ", as the former process was stopped",
+        TakeOverCause::Hung => ", as the former process made no progress",
         TakeOverCause::HandedOver => ", on request",
     }
 }

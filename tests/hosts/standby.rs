@@ -1,5 +1,5 @@
 //! The standbys of ingress and of the critical lane take over when the process that serves the role is
-//! killed, stopped or asked to end. Uses real processes, signals and DDS peers on separate hosts.
+//! killed, stopped, hangs or is asked to end. Uses real processes, signals and DDS peers on separate hosts.
 
 use std::time::Duration;
 
@@ -9,10 +9,33 @@ use support::bed::{Bed, CRITICAL, INPUT, SCAN, STANDBYS};
 use support::peer::{Peer, Received, RunningPeer, Sent};
 use support::process::signal;
 use support::ros;
+use support::threads::{self, Fault};
 
 const RATE_HZ: f64 = 200.0;
 /// The subscriber whose samples are looked at one by one.
 const WATCHED: &str = "Cyclone DDS, RELIABLE";
+
+const LANE: &str = "egress-critical";
+
+/// What happens to an active process.
+#[derive(Clone, Copy, Debug)]
+enum Event {
+    Signal(Signal),
+    /// Its thread of that name, or its main thread, hangs.
+    Hang(Option<&'static str>),
+}
+
+impl Event {
+    /// The cause of the take-over, as the status shows it.
+    fn cause(self) -> &'static str {
+        match self {
+            Self::Signal(Signal::SIGSTOP) => "stopped",
+            Self::Signal(Signal::SIGTERM) => "handed_over",
+            Self::Signal(_) => "ended",
+            Self::Hang(_) => "hung",
+        }
+    }
+}
 
 /// The processes of a role, as the status shows them.
 fn process(status: &Value, name: &str) -> Value {
@@ -62,6 +85,21 @@ fn end(name: &str, subscriber: RunningPeer, sent: &Sent) -> Received {
 #[test]
 fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
     let test = "a_standby_takes_over_and_no_subscriber_misses_a_sample";
+    let signals = [Signal::SIGKILL, Signal::SIGSTOP, Signal::SIGTERM, Signal::SIGKILL].map(Event::Signal);
+    let events: Vec<_> = signals.into_iter().flat_map(|event| [(LANE, event), ("ingress", event)]).collect();
+    take_over(test, &events, Peer::cyclone().keep_all());
+}
+
+#[test]
+fn a_standby_takes_over_from_a_process_that_hangs() {
+    let test = "a_standby_takes_over_from_a_process_that_hangs";
+    let event_loop = threads::THREADS[1];
+    let events = [(LANE, Event::Hang(None)), ("ingress", Event::Hang(event_loop))];
+    // For half a second ingress acknowledges nothing, for which a KEEP_ALL publisher waits.
+    take_over(test, &events, Peer::cyclone().keep_last(1_000));
+}
+
+fn take_over(test: &str, events: &[(&str, Event)], publisher: Peer) {
     // It asserts that no sample is lost.
     let _alone = support::exclusive();
     let Some(bed) = Bed::start(test, &format!("{SCAN}{STANDBYS}")) else { return };
@@ -75,7 +113,7 @@ fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
     }
     let subscribers: Vec<_> =
         peers.into_iter().map(|(name, peer)| (name, bed.subscribe("critical", peer, CRITICAL))).collect();
-    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(RATE_HZ), INPUT);
+    let publisher = bed.publish(publisher.rate_hz(RATE_HZ), INPUT);
     let all_receive = |more: u64| {
         let goals: Vec<u64> = subscribers.iter().map(|(_, one)| one.received() + more).collect();
         for ((_, subscriber), goal) in subscribers.iter().zip(goals) {
@@ -84,23 +122,15 @@ fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
     };
     all_receive(100);
     let mut stopped = Vec::new();
-    let lane = "egress-critical";
-    let events = [
-        (lane, Signal::SIGKILL),
-        ("ingress", Signal::SIGKILL),
-        (lane, Signal::SIGSTOP),
-        ("ingress", Signal::SIGSTOP),
-        (lane, Signal::SIGTERM),
-        ("ingress", Signal::SIGTERM),
-        (lane, Signal::SIGKILL),
-        ("ingress", Signal::SIGKILL),
-    ];
-    for (index, (name, sent)) in events.into_iter().enumerate() {
+    for (index, &(name, event)) in events.iter().enumerate() {
         let active = wait_standby(&bed, name);
         let watched = subscribers.iter().find(|(name, _)| *name == WATCHED).map(|(_, one)| one).unwrap();
         let before = usize::try_from(watched.received()).unwrap();
-        signal(active, sent);
-        if sent == Signal::SIGSTOP {
+        match event {
+            Event::Signal(sent) => signal(active, sent),
+            Event::Hang(thread) => threads::cause(Fault::Hang, active, threads::thread(active, thread)),
+        }
+        if event.cause() == "stopped" {
             stopped.push(active);
         }
         let take_overs = index as u64 / 2 + 1;
@@ -109,15 +139,10 @@ fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
         });
         all_receive(100);
         let standby = process(&status, name)["standby"].clone();
-        let cause = match sent {
-            Signal::SIGSTOP => "stopped",
-            Signal::SIGTERM => "handed_over",
-            _ => "ended",
-        };
-        assert_eq!(standby["cause"], cause, "{name}, {sent}: {standby}");
+        assert_eq!(standby["cause"], event.cause(), "{name}, {event:?}: {standby}");
         let took_ms = number(&standby["took_ns"]) as f64 / 1e6;
         let pause_ms = pauses_ms(watched, before.saturating_sub(10)).into_iter().fold(0.0, f64::max);
-        println!("{name}, {sent}: taken over in {took_ms:.1} ms, longest pause {pause_ms:.1} ms");
+        println!("{name}, {event:?}: taken over in {took_ms:.1} ms, longest pause {pause_ms:.1} ms");
     }
     // A process that was stopped and continued late must not speak with the identity of the active one.
     for pid in stopped {

@@ -15,14 +15,8 @@ use support::process::signal;
 const BOOTSTRAPPED: &str = "adaptive-bridge-test-base";
 const BOOTSTRAPPED_RUST: &str = "adaptive-bridge-test-rust";
 
-const CONTAINERS: [&str; 6] = [
-    "ingress",
-    "egress-critical",
-    "egress-noncritical",
-    "control",
-    "standby-ingress",
-    "standby-critical",
-];
+const CONTAINERS: [&str; 6] =
+    ["ingress", "egress-critical", "egress-noncritical", "control", "standby-ingress", "standby-critical"];
 
 fn run(command: &mut Command) -> String {
     let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
@@ -301,6 +295,14 @@ fn samples_flow_after_any_container_is_killed_and_down_leaves_nothing() {
         flow.wait_on();
     }
     flow.end();
+    let status =
+        run(deployment.compose().args(["exec", "-T", "control", "adaptive-bridge", "status", "--json"]));
+    let status: serde_json::Value = serde_json::from_str(&status).unwrap();
+    for name in ["ingress", "egress-critical"] {
+        let processes = status["processes"].as_array().unwrap();
+        let process = processes.iter().find(|process| process["name"] == name).unwrap();
+        assert!(process["standby"]["take_overs"].as_u64() > Some(0), "{process}");
+    }
     run(deployment.compose().args(["down", "--volumes"]));
     assert_eq!(deployment.left(), "");
 }

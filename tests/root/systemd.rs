@@ -1,6 +1,7 @@
 //! The bridge as services of a real systemd: hardened, supervised, restarted. Machines in containers, real
 //! signals, real DDS peers on hosts of their own.
 
+use std::collections::HashMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -218,8 +219,8 @@ fn a_killed_or_stopped_unit_is_restarted_and_delays_no_other() {
 
 /// Either unit of a role may have it: the one that finds it taken waits.
 #[test]
-fn a_standby_takes_over_from_a_killed_stopped_or_restarted_unit() {
-    let test = "a_standby_takes_over_from_a_killed_stopped_or_restarted_unit";
+fn a_standby_takes_over_from_a_unit_that_is_killed_stopped_restarted_or_hangs() {
+    let test = "a_standby_takes_over_from_a_unit_that_is_killed_stopped_restarted_or_hangs";
     let Some(bed) = Bed::boot(test, SCAN) else { return };
     bed.start();
     for standby in STANDBYS {
@@ -230,31 +231,43 @@ fn a_standby_takes_over_from_a_killed_stopped_or_restarted_unit() {
         status["processes"].as_array()?.iter().find(|process| process["name"] == name).cloned()
     };
     let flow = bed.flow();
-    let mut take_overs = 0;
-    for signal in ["KILL", "STOP", "TERM", "KILL"] {
-        take_overs += 1;
-        for (name, units) in
-            [("egress-critical", [EGRESS_CRITICAL, STANDBYS[1]]), ("ingress", [INGRESS, STANDBYS[0]])]
-        {
-            let active = support::wait_for(format!("a standby of {name}"), || {
-                let process = process(name).filter(|process| process["standby"]["pid"] != 0)?;
-                Some(process["pid"].to_string())
-            });
-            // See the test above. A standby has the sockets of the active process after 0.1 s.
-            std::thread::sleep(Duration::from_millis(1_500));
-            if signal == "TERM" {
-                let unit = units.into_iter().find(|unit| bed.machine.main_pid(unit) == active);
-                bed.machine.run(&["systemctl", "restart", unit.expect("a unit of the active process")]);
-            } else {
-                bed.machine.run(&["kill", "-s", signal, &active]);
+    let (lane, ingress) =
+        (("egress-critical", [EGRESS_CRITICAL, STANDBYS[1]]), ("ingress", [INGRESS, STANDBYS[0]]));
+    let of_both =
+        ["KILL", "STOP", "TERM", "KILL"].into_iter().flat_map(|what| [(lane, what), (ingress, what)]);
+    let mut take_overs = HashMap::new();
+    for ((name, units), what) in [(lane, "hang")].into_iter().chain(of_both) {
+        let active = support::wait_for(format!("a standby of {name}"), || {
+            let process = process(name).filter(|process| process["standby"]["pid"] != 0)?;
+            Some(process["pid"].to_string())
+        });
+        // See the test above. A standby has the sockets of the active process after 0.1 s.
+        std::thread::sleep(Duration::from_millis(1_500));
+        let unit = units.into_iter().find(|unit| bed.machine.main_pid(unit) == active);
+        let unit = unit.expect("a unit of the active process");
+        match what {
+            "hang" => {
+                let process = bed.machine.outer_main_pid(unit);
+                cause(Fault::Hang, process, thread(process, None));
             }
-            let took = support::wait_for(format!("take-over {take_overs} of {name}"), || {
-                let standby = &process(name)?["standby"];
-                (standby["take_overs"] == take_overs).then(|| standby["took_ns"].clone())
-            });
-            println!("{name}, SIG{signal}: taken over in {took} ns");
-            flow.wait_on();
+            "TERM" => drop(bed.machine.run(&["systemctl", "restart", unit])),
+            signal => drop(bed.machine.run(&["kill", "-s", signal, &active])),
         }
+        let take_overs = take_overs.entry(name).or_insert(0);
+        *take_overs += 1;
+        let standby = support::wait_for(format!("take-over {take_overs} of {name}"), || {
+            let standby = process(name)?["standby"].clone();
+            (standby["take_overs"] == *take_overs).then_some(standby)
+        });
+        println!("{name}, {what}: taken over in {} ns", standby["took_ns"]);
+        let cause = match what {
+            "hang" => "hung",
+            "STOP" => "stopped",
+            "TERM" => "handed_over",
+            _ => "ended",
+        };
+        assert_eq!(standby["cause"], cause, "{standby}");
+        flow.wait_on();
     }
     assert_eq!(flow.critical.matches(), (1, 0));
     let (sent, received) = flow.end();

@@ -66,6 +66,7 @@ pub(super) fn take_over_storm(process: &ProcessReading, now: &Snapshot) -> Optio
     let standby = &process.standby;
     let what = match standby.cause()? {
         TakeOverCause::Stopped => "was stopped by a signal",
+        TakeOverCause::Hung => "made no progress",
         TakeOverCause::Ended | TakeOverCause::HandedOver => "ended",
     };
     is_take_over_storm(standby, now.at).then(|| {

@@ -135,6 +135,8 @@ numbered! {
     Stopped = 2, "stopped",
     /// The active process was asked to end, and handed the role over.
     HandedOver = 3, "handed_over",
+    /// The active process made no progress, and the standby killed it.
+    Hung = 4, "hung",
 }
 
 numbered! {

@@ -57,6 +57,6 @@ pub use safety::{
 };
 pub use sequence::{SequenceOutcome, SequenceTracker};
 pub use staleness::{age_ns, is_stale};
-pub use take_overs::{is_take_over_storm, may_fence, take_overs_in_a_row};
+pub use take_overs::{hang_limit_ms, is_take_over_storm, may_fence, take_overs_in_a_row};
 pub use token_bucket::{BURST_WINDOW_NS, ByteBudget, MAX_RATE_HZ, TokenBucket, burst_for};
 pub use warnings::{SubscriberWarnings, WarningThresholds};

@@ -88,8 +88,8 @@ impl RestartBackoff {
     }
 }
 
-/// The longest step that [`HangWatch`] counts between two checks. A longer pause is one of the supervisor
-/// itself, which was stopped, and with it perhaps its children.
+/// The longest step that [`HangWatch`] counts between two checks; of a short limit, a quarter of it. A longer
+/// pause is one of the supervisor itself, which was stopped, and with it perhaps its children.
 const MAX_STEP_MS: u64 = 500;
 
 /// How many times its limit a child may make no progress while it waits for a CPU. On a machine that is
@@ -113,6 +113,11 @@ impl HangWatch {
         Self { limit_ms, alive_at: MonotonicNs(0), checked_at: now, stalled_ns: 0, starved_ns: 0 }
     }
 
+    /// Changes the limit.
+    pub const fn set_limit_ms(&mut self, limit_ms: u64) {
+        self.limit_ms = limit_ms;
+    }
+
     /// Whether the child has made no progress since the last check.
     pub fn is_stalled(&self, alive_at: MonotonicNs) -> bool {
         alive_at == self.alive_at
@@ -122,9 +127,9 @@ impl HangWatch {
     /// it has made none for the limit, in the time that the supervisor itself was running. While the child is
     /// `starved`, a thread of it is ready to run and gets little CPU time, up to ten times the limit more.
     pub fn has_hung(&mut self, alive_at: MonotonicNs, starved: bool, now: MonotonicNs) -> bool {
-        let step_ns = now.since(self.checked_at).min(MAX_STEP_MS * 1_000_000);
-        self.checked_at = now;
         let limit_ns = self.limit_ms * 1_000_000;
+        let step_ns = now.since(self.checked_at).min(MAX_STEP_MS * 1_000_000).min(limit_ns / 4);
+        self.checked_at = now;
         if !self.is_stalled(alive_at) {
             self.alive_at = alive_at;
             (self.stalled_ns, self.starved_ns) = (0, 0);

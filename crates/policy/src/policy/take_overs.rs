@@ -1,4 +1,4 @@
-//! When a standby kills an active process that is stopped, and when take-overs are too many.
+//! When a standby kills an active process that is stopped or hangs, and when take-overs are too many.
 
 use crate::model::{MonotonicNs, StandbyRecord, TakeOverCause};
 
@@ -6,16 +6,33 @@ use crate::model::{MonotonicNs, StandbyRecord, TakeOverCause};
 /// leaves none if it ends within a second.
 const PAUSE_MS: u64 = 1_500;
 
+/// How long an active process may make no progress. It completes a turn every 100 ms even without samples,
+/// and stops doing so up to 250 ms after a thread of the DDS library has hung.
+const HANG_MS: u64 = 500;
+/// More for each route: a turn may create an endpoint or a connection of each.
+const HANG_MS_PER_ROUTE: u64 = 10;
+/// The most, after several take-overs in a row: the limit of the watchdogs of systemd and `up`.
+const MAX_HANG_MS: u64 = 2_000;
+
 /// The longest time between two take-overs in a row.
 const IN_A_ROW_MS: u64 = 60_000;
 
 /// How many take-overs in a row are a storm.
 const STORM: u64 = 5;
 
-/// Whether a standby may kill a process that is stopped, `now`, when its role was last taken over at
+/// Whether a standby may kill a process that is stopped or hangs, `now`, when its role was last taken over at
 /// `taken_over_at` (0: never). A program that stops each process causes at most 40 take-overs a minute.
 pub const fn may_fence(taken_over_at: MonotonicNs, now: MonotonicNs) -> bool {
     taken_over_at.0 == 0 || now.since(taken_over_at) >= PAUSE_MS * 1_000_000
+}
+
+/// How long the active process of a role in a bridge with so many `routes` may make no progress, `now`,
+/// before its standby kills it, in milliseconds. Each take-over in a row doubles it: if the machine is so
+/// slow that working processes are killed, they are so less and less often.
+pub fn hang_limit_ms(record: &StandbyRecord, routes: usize, now: MonotonicNs) -> u64 {
+    let doublings = if is_recent(record, now) { record.in_a_row.min(2) } else { 0 };
+    let once_ms = (routes as u64).saturating_mul(HANG_MS_PER_ROUTE).saturating_add(HANG_MS);
+    (once_ms.min(MAX_HANG_MS) << doublings).min(MAX_HANG_MS)
 }
 
 /// How many take-overs have followed each other within a minute, with one that happens `now` for `cause`
@@ -48,6 +65,23 @@ mod tests {
         assert!(may_fence(MonotonicNs(0), at(1)));
         assert!(!may_fence(at(1), at(1_500)));
         assert!(may_fence(at(1), at(1_501)));
+    }
+
+    #[test]
+    fn the_time_without_progress_doubles_with_take_overs_and_grows_with_routes() {
+        let limit_ms = |in_a_row, routes, ms| {
+            let record = StandbyRecord { taken_over_at: at(1), in_a_row, ..StandbyRecord::default() };
+            hang_limit_ms(&record, routes, at(ms))
+        };
+        assert_eq!(
+            [0, 1, 2, 3, u64::MAX].map(|in_a_row| limit_ms(in_a_row, 0, 60_001)),
+            [500, 1_000, 2_000, 2_000, 2_000]
+        );
+        assert_eq!(limit_ms(3, 0, 60_002), 500, "a minute has passed");
+        assert_eq!(
+            [1, 60, 1_024, usize::MAX].map(|routes| limit_ms(0, routes, 60_001)),
+            [510, 1_100, 2_000, 2_000]
+        );
     }
 
     #[test]
