@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use serde_json::Value;
-use support::bed::{Bed, CRITICAL, INPUT, outputs};
+use support::bed::{Bed, CRITICAL, INPUT, STANDBYS, outputs};
 use support::impairment::Impairment;
 use support::netns::Host;
 use support::pacer::paced;
@@ -141,7 +141,7 @@ fn crowd(test: &str, flow: &Flow) {
     }
     let yaml = format!(
         "topics:\n  - {{id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, \
-         max_sample_bytes: {}}}\n",
+         max_sample_bytes: {}}}\n{STANDBYS}",
         flow.max_sample_bytes
     );
     let _alone = support::exclusive();
@@ -228,6 +228,7 @@ fn crowd(test: &str, flow: &Flow) {
     for mut subscriber in idle {
         subscriber.kill9();
     }
+    bed.assert_no_take_over();
     bed.end();
 }
 

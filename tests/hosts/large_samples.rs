@@ -3,7 +3,7 @@
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
-use support::bed::{Bed, outputs};
+use support::bed::{Bed, STANDBYS, outputs};
 use support::peer::{Library, Peer, Received, RunningPeer, Sent};
 use support::process::signal;
 use support::ros;
@@ -34,7 +34,7 @@ fn a_full_hd_image_and_a_map_of_4_mb_pass_with_the_default_configuration() {
     let test = "a_full_hd_image_and_a_map_of_4_mb_pass_by_default";
     let yaml = "topics:\n  - {id: image, input_topic: /image, message_type: sensor_msgs/msg/Image}\n  \
                 - {id: map, input_topic: /map, message_type: nav_msgs/msg/OccupancyGrid}\n";
-    let Some(bed) = Bed::start(test, yaml) else { return };
+    let Some(bed) = Bed::start(test, &format!("{yaml}{STANDBYS}")) else { return };
     for (id, kind, bytes) in [
         ("image", "sensor_msgs::msg::dds_::Image_", 6_220_800),
         ("map", "nav_msgs::msg::dds_::OccupancyGrid_", 4_000_000),
@@ -46,6 +46,7 @@ fn a_full_hd_image_and_a_map_of_4_mb_pass_with_the_default_configuration() {
         subscriber.end::<Received>().assert_all_of(&sent);
     }
     bed.wait_accounted();
+    bed.assert_no_take_over();
     bed.end();
 }
 

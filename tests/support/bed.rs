@@ -149,6 +149,13 @@ impl Bed {
         addresses
     }
 
+    /// Asserts that no standby has taken a role over: they kill only processes that are stopped or hang.
+    pub fn assert_no_take_over(&self) {
+        for process in self.bridge.status()["processes"].as_array().into_iter().flatten() {
+            assert_eq!(process["standby"]["take_overs"], 0, "{process}\n{}", self.up.log());
+        }
+    }
+
     /// Terminates the bridge and asserts that it ends successfully.
     pub fn end(mut self) {
         let status = self.up.terminate();
