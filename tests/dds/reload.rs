@@ -306,15 +306,30 @@ fn kill_each(bridge: &Bridge, names: &[&str]) {
 
 #[test]
 fn crashed_processes_restart_with_the_configuration_in_force() {
-    let bridge = Bridge::new(&file(115, ""));
+    the_next_process_has_the_configuration_in_force(115, "none");
+}
+
+#[test]
+fn a_standby_takes_over_with_the_configuration_in_force() {
+    the_next_process_has_the_configuration_in_force(126, "warm");
+}
+
+fn the_next_process_has_the_configuration_in_force(domain_id: u16, standby: &str) {
+    let file = |lanes: &str| {
+        let keys = format!(
+            "processes: {{ingress: {{standby: {standby}}}}}\nlanes: {{critical: {{standby: {standby}}}{lanes}}}"
+        );
+        file(domain_id, &keys)
+    };
+    let bridge = Bridge::new(&file(""));
     let in_force = settings(&bridge);
     let (up, _) = up(&bridge);
-    let _flow = flow(&bridge, 115);
+    let _flow = flow(&bridge, domain_id);
     wait_rate(&bridge, 10.0);
     let all = ["egress-critical", "egress-noncritical", "ingress", "control"];
 
     // A lane more.
-    bridge.write_config(&file(115, "lanes: {rviz: {}, noncritical: {max_rate_hz: 20}}"));
+    bridge.write_config(&file(", rviz: {}, noncritical: {max_rate_hz: 20}"));
     let (code, output) = reload(&bridge);
     assert_eq!(code, Some(5), "{output}");
     kill_each(&bridge, &all);
