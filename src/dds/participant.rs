@@ -97,8 +97,8 @@ const GRAPH_WINDOW_SAMPLES: usize = 1024;
 /// A part of the entity id of the writer of graph entries, which is the same in each process.
 const GRAPH_KEY: [u8; 3] = [0xff; 3];
 
-/// An eighth of the shortest time of a watchdog. A check wakes two threads, and housekeeping runs up to 100
-/// times a second.
+/// An eighth of the shortest time of a watchdog; it adds to the time after which a standby kills the
+/// process. A check wakes two threads, and housekeeping runs up to 100 times a second.
 const CHECK_TURNS_MS: u64 = 250;
 
 impl Participant {
