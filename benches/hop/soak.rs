@@ -24,8 +24,8 @@ const RESTARTS_BEFORE: usize = 800;
 /// The point clouds that follow each of these restarts. Without them ingress grew by 3 MiB in the first 25
 /// minutes of the measurement, and hardly from then on.
 const CLOUDS_BEFORE: usize = 20;
-/// Of these restarts one in so many is by SIGKILL: 400 participants, more than the 256 that a process
-/// remembers of those whose lease ended.
+/// One in so many of the restarts before the measurement is by SIGKILL: 400 participants, more than the 256
+/// that a process remembers of those whose lease ended.
 const KILLED_BEFORE: usize = 4;
 
 /// The highest number of points of a series in the summary.
@@ -40,7 +40,7 @@ pub fn measure(duration: Duration, options: &Options, output: &mut Output) -> Re
         load: format!(
             "{} for {SCANS_S} s and {} for {CLOUDS_S} s, in turn; publisher and subscriber are restarted after \
              each turn, one time in two by SIGKILL, and {RESTARTS_BEFORE} times before, one in {KILLED_BEFORE} \
-             by SIGKILL",
+             by SIGKILL, with {CLOUDS_BEFORE} point clouds each",
             scans.name(),
             clouds.name()
         ),

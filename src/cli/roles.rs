@@ -131,9 +131,8 @@ fn role(
     let joined = if is_standby() { InForce::wait(&file, load) } else { InForce::join(&file, load) };
     let in_force = match joined {
         Ok(in_force) => in_force,
-        Err(error @ InForceError::NoBridge { .. }) => return run(|_| Err(error)),
         Err(InForceError::Config(error)) => return Err(bad_configuration(&error)),
-        Err(InForceError::Shm(error)) => return run(|_| Err(error)),
+        Err(error) => return run(|_| Err(error)),
     };
     let configuration = in_force.configuration().clone();
     telemetry::set_verbosity(configuration.settings.diagnostics.verbosity);

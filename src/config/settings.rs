@@ -423,10 +423,9 @@ pub enum SchedulingPolicy {
 }
 
 /// Whether a process has a second one, which takes its role over when it ends.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Standby {
     /// No: the supervisor starts the next process.
-    #[default]
     None,
     /// The second process is started with the first one, and waits.
     Warm,

@@ -304,11 +304,11 @@ impl Waiting {
     /// Kills the active process if a signal has stopped it or if it makes no progress: continued later, it
     /// would be a second speaker with the same identity.
     fn fence(&mut self, name: &str) {
-        let Some(active) = &mut self.active else { return };
+        let Some(active) = self.active.as_mut().filter(|_| self.fences) else { return };
         let (now, record) = (clock::monotonic(), self.board.get());
         let limit_ms = hang_limit_ms(record, self.routes, now);
         let health = self.boards.health(self.role);
-        let Some(cause) = active.fault(health, limit_ms, now).filter(|_| self.fences) else { return };
+        let Some(cause) = active.fault(health, limit_ms, now) else { return };
         if !may_fence(record.taken_over_at, now) {
             return;
         }

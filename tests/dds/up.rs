@@ -5,6 +5,7 @@ use std::process::Command;
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
+use support::bed::NO_STANDBYS;
 use support::bridge::{Bridge, program};
 use support::process::{Process, signal};
 
@@ -13,8 +14,7 @@ fn bridge(domain_id: u16, shared_memory: &str) -> Bridge {
     Bridge::new(&format!(
         "instance: {{instance}}\nros: {{domain_id: {domain_id}}}\n\
          topics:\n  - {{id: scan, input_topic: /scan, max_sample_bytes: 8192}}\n\
-         shared_memory: {{root_path: {{folder}}/root{shared_memory}}}\n\
-         lanes: {{critical: {{standby: none}}}}\nprocesses: {{ingress: {{standby: none}}}}\n"
+         shared_memory: {{root_path: {{folder}}/root{shared_memory}}}\n{NO_STANDBYS}"
     ))
 }
 

@@ -7,7 +7,7 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 use nix::unistd::Pid;
 use serde_json::Value;
-use support::bed::{Bed, CRITICAL, INPUT, NONCRITICAL, SCAN, outputs};
+use support::bed::{Bed, CRITICAL, INPUT, NO_STANDBYS, NONCRITICAL, SCAN, outputs};
 use support::bridge::Bridge;
 use support::peer::{Peer, Received, RunningPeer, Sent};
 use support::process::{Process, signal};
@@ -466,18 +466,18 @@ fn wait_ended(mut process: Process) -> (Option<i32>, String) {
 
 #[test]
 fn a_second_egress_of_a_lane_is_refused_and_names_the_first() {
-    // A second one of the critical lane would be its standby.
-    let bridge = Bridge::new(&format!("instance: {{instance}}\nros: {{domain_id: 120}}\n{SCAN}"));
-    let mut first = bridge.start("egress --lane noncritical");
+    let bridge =
+        Bridge::new(&format!("instance: {{instance}}\nros: {{domain_id: 120}}\n{SCAN}{NO_STANDBYS}"));
+    let mut first = bridge.start("egress --lane critical");
     first.wait_for_log("egress is up");
-    let (code, log) = wait_ended(bridge.start("egress --lane noncritical"));
+    let (code, log) = wait_ended(bridge.start("egress --lane critical"));
     assert_eq!(code, Some(1), "{log}");
-    assert!(log.contains("egress-noncritical") && log.contains(&first.pid().to_string()), "{log}");
+    assert!(log.contains("egress-critical") && log.contains(&first.pid().to_string()), "{log}");
     let (code, log) = wait_ended(bridge.start("egress --lane nosuch"));
     assert_eq!(code, Some(1), "{log}");
     assert!(log.contains("nosuch") && log.contains("critical, noncritical"), "{log}");
     first.kill9();
-    let mut again = bridge.start("egress --lane noncritical");
+    let mut again = bridge.start("egress --lane critical");
     again.wait_for_log("egress is up");
     assert!(again.terminate().success(), "{}", again.log());
 }

@@ -8,7 +8,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
-use support::bed::{CRITICAL, INPUT, NONCRITICAL, SCAN};
+use support::bed::{CRITICAL, INPUT, NO_STANDBYS, NONCRITICAL, SCAN};
 use support::machine::{Machine, install, machine_missing};
 use support::netns::{Host, Net};
 use support::peer::{Peer, Received, RunningPeer, Sent};
@@ -22,8 +22,6 @@ const CONTROL: &str = "adaptive-bridge-control.service";
 const UNITS: [&str; 4] = [INGRESS, EGRESS_CRITICAL, EGRESS_NONCRITICAL, CONTROL];
 const STANDBYS: [&str; 2] =
     ["adaptive-bridge-standby-ingress.service", "adaptive-bridge-standby-critical.service"];
-/// The keys without which ingress and the critical lane have standbys.
-const NO_STANDBYS: &str = "lanes: {critical: {standby: none}}\nprocesses: {ingress: {standby: none}}\n";
 const RESPONDER: &str = "adaptive-bridge-responder@laptop.service";
 
 const CONFIG: &str = "/etc/adaptive-bridge/config.yaml";

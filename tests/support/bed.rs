@@ -15,8 +15,10 @@ pub const SCAN: &str = "topics:\n  - {id: scan, input_topic: /scan, message_type
                         max_sample_bytes: 65536}\n";
 /// The keys with which ingress and the critical lane have standbys in a bed.
 pub const STANDBYS: &str = "lanes: {critical: {standby: warm}}\nprocesses: {ingress: {standby: warm}}\n";
-/// The options of `up` with which they have none.
-const NO_STANDBYS: &str =
+/// The keys with which they have none.
+pub const NO_STANDBYS: &str = "lanes: {critical: {standby: none}}\nprocesses: {ingress: {standby: none}}\n";
+/// The same as options of `up`, for a file that has other keys of these.
+const NO_STANDBYS_OPTIONS: &str =
     " --parameter lanes.critical.standby:=none --parameter processes.ingress.standby:=none";
 /// The DDS type of the route.
 pub const SCAN_TYPE: &str = "sensor_msgs::msg::dds_::LaserScan_";
@@ -59,7 +61,7 @@ impl Bed {
         }
         let net = Net::new(&[&["publisher", "bridge", "critical", "slow"], more].concat());
         let bridge = Bridge::new(&format!("instance: {{instance}}\n{yaml}"));
-        let standbys = if yaml.contains("standby: warm") { "" } else { NO_STANDBYS };
+        let standbys = if yaml.contains("standby: warm") { "" } else { NO_STANDBYS_OPTIONS };
         let up = bridge.start_on(net.host("bridge"), &format!("{up}{standbys}"));
         let bed = Self { up, bridge, net };
         bed.wait_up();
@@ -68,7 +70,7 @@ impl Bed {
 
     /// Starts `up`, which has ended, without standbys, and waits until its processes are up.
     pub fn start_up_again(&mut self) {
-        self.up = self.bridge.start_on(self.net.host("bridge"), &format!("up{NO_STANDBYS}"));
+        self.up = self.bridge.start_on(self.net.host("bridge"), &format!("up{NO_STANDBYS_OPTIONS}"));
         self.wait_up();
     }
 

@@ -231,6 +231,12 @@ mod tests {
         assert!(!watch.has_hung(at(200), false, at(250)));
         assert!(!watch.has_hung(at(200), false, at(3_600_250)), "an hour in SIGSTOP counts as 500 ms");
         assert!(!watch.has_hung(at(3_600_300), false, at(3_600_500)));
+
+        // With a short limit, no pause by itself reaches it.
+        watch.set_limit_ms(400);
+        let hung_at =
+            (1..).find(|hour| watch.has_hung(at(3_600_300), false, at(3_600_500 + hour * 3_600_000)));
+        assert_eq!(hung_at, Some(4));
     }
 
     #[test]
