@@ -155,9 +155,7 @@ fn take_over(test: &str, events: &[(&str, Event)], publisher: Peer) {
     for (name, subscriber) in subscribers {
         let received = end(name, subscriber, &sent);
         received.assert_sound();
-        // A BEST_EFFORT subscriber may miss the sample that was numbered and not sent at a kill.
-        let most = if name.ends_with("BEST_EFFORT") { events.len() as u64 } else { 0 };
-        assert!(received.missing_count <= most, "{name}: {received:?}");
+        assert_eq!(received.missing_count, 0, "{name}: {received:?}");
     }
     bed.end();
 }

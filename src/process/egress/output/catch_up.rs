@@ -98,7 +98,7 @@ impl Output {
     }
 
     /// Whether matched readers lack samples of the former process that are not counted yet. The library sends
-    /// them when the writer is created, before a reader has matched, and again when a reader requests them.
+    /// them when the last former reader has matched, and to a reader that is not ready then when it is.
     fn lack_former(&self, writer: &RawWriter) -> bool {
         let lacks = |reader: ReaderRecord| reader.reliable == 1 && reader.unacknowledged > 0;
         self.unsent.len() > 0 && writer.matched_readers().any(lacks)

@@ -1252,6 +1252,10 @@ impl DPEventLoop {
             &RtpsReaderProxy::from_discovered_reader_data(remote_reader, &[], &[]),
             &requested_qos,
           );
+          // Samples of a former writer may have waited for this reader.
+          if writer.has_unsent() {
+            self.writers_with_more.insert(writer.entity_id());
+          }
         }
       }
     }

@@ -886,6 +886,11 @@ impl Writer {
     }
   }
 
+  /// Whether a sample waits to be sent.
+  pub fn has_unsent(&self) -> bool {
+    self.send_buffer.has_unsent()
+  }
+
   /// Sends what is pending, at most `PENDING_TURN_MAX_BYTES`. Returns whether samples
   /// are left for another turn that no full socket holds back.
   pub fn process_pending(&mut self) -> bool {
@@ -894,6 +899,9 @@ impl Writer {
     // shared buffer's `last_seq` is the source of truth.
     let send_buffer = self.send_buffer.clone();
     let _no_other_sender = send_buffer.direct_send().lock();
+    if send_buffer.holds_unsent() {
+      return false;
+    }
     let mut turn_bytes = 0;
     while turn_bytes < PENDING_TURN_MAX_BYTES {
       let last_available = self.send_buffer.last_change_sequence_number();
@@ -1921,6 +1929,7 @@ impl Writer {
     // Whether an INFO_TS in `datagram` still applies to the next DATA.
     let mut ts_active = false;
     let mut pending_gap_sent = false;
+    let mut has_sent_sample = false;
     let mut round_bytes = 0;
     let round_max_bytes = if reader_proxy.is_reached_over_loopback() {
       REPAIR_BATCH_MAX_BYTES_LOOPBACK
@@ -2029,13 +2038,35 @@ impl Writer {
         ts_active = source_timestamp.is_some();
       }
       reader_proxy.mark_change_repaired(unsent_sn, Instant::now());
+      has_sent_sample = true;
     }
 
-    self.flush_repair_datagram(&mut datagram, reader_proxy);
     if reader_proxy.first_unsent_change().is_none() {
       reader_proxy.repair_mode = false;
+      // Late joiners get a history in the order that their ACKNACKs ask for.
+      if has_sent_sample && self.qos_policies.is_volatile() && reader_proxy.qos().is_reliable() {
+        let heartbeat = self.heartbeat_after_repair(reader_guid);
+        self.add_to_repair_datagram(&mut datagram, heartbeat, 0, reader_proxy);
+      }
     }
+    self.flush_repair_datagram(&mut datagram, reader_proxy);
   } // fn
+
+  // The HEARTBEAT after the last one of the samples or fragments that a reader has requested. It
+  // requests an ACKNACK: repairs get lost, too, and a writer that waits for the acknowledgement
+  // may send nothing else.
+  fn heartbeat_after_repair(&self, reader_guid: GUID) -> MessageBuilder {
+    MessageBuilder::new().heartbeat_msg(
+      self.entity_id(),
+      self.send_buffer.advertised_first(),
+      self.last_advertised(),
+      self.next_heartbeat_count(),
+      self.endianness,
+      reader_guid.entity_id,
+      false, // final_flag
+      false, // liveliness_flag
+    )
+  }
 
   // Whether a late joiner is not told yet that this sample of the history is gone, which a
   // later one of its source has replaced: the HEARTBEAT of `withdraw_msg` would withdraw
@@ -2173,8 +2204,8 @@ impl Writer {
   // until REPAIR_FRAGS_MAX_BYTES have gone out. Runs of fragments share a DATAFRAG,
   // and DATAFRAGs a datagram, as far as the reader's path MTU allows. The HEARTBEAT
   // after the last one makes the reader say at once what is still missing: a
-  // NACK_FRAG names 256 fragments at most, and repairs get lost, too. Returns whether
-  // a requested sample was evicted meanwhile, which needs a GAP.
+  // NACK_FRAG names 256 fragments at most. Returns whether a requested sample was
+  // evicted meanwhile, which needs a GAP.
   fn handle_repair_frags_send_worker(
     &mut self,
     reader_proxy: &mut RtpsReaderProxy, /* This is mutable proxy temporarily detached from the
@@ -2263,16 +2294,7 @@ impl Writer {
     }
 
     if round_bytes > 0 && !reader_proxy.repair_frags_requested() {
-      let heartbeat = MessageBuilder::new().heartbeat_msg(
-        self.entity_id(),
-        self.send_buffer.advertised_first(),
-        self.last_advertised(),
-        self.next_heartbeat_count(),
-        self.endianness,
-        reader_guid.entity_id,
-        false, // final_flag: request ACKNACK
-        false, // liveliness_flag
-      );
+      let heartbeat = self.heartbeat_after_repair(reader_guid);
       self.add_to_repair_datagram(&mut datagram, heartbeat, 0, reader_proxy);
     }
     self.flush_repair_datagram(&mut datagram, reader_proxy);
@@ -5077,6 +5099,62 @@ mod tests {
         write(&f, 1, 8);
         assert_eq!(only_reader(&f).unacknowledged, 1);
       }
+    }
+
+    // The reader acknowledges at once what it lacked of a former process' samples, instead of with
+    // the next sample: that one may wait for the acknowledgement.
+    #[test]
+    fn only_the_last_repair_round_ends_with_a_heartbeat() {
+      let mut f = keep_last_after(41);
+      acknowledge(&mut f, 42, &[], 1);
+      write(&f, 10, 2_000);
+      f.writer.nack_response_delay = StdDuration::ZERO;
+      acknowledge(&mut f, 42, &(42..52).collect::<Vec<_>>(), 2);
+      let mut round = || {
+        let before = f.writer.next_heartbeat_count();
+        let repaired = f.repair_round();
+        (repaired, f.writer.next_heartbeat_count() - before - 1)
+      };
+      assert_eq!([(); 3].map(|()| round()), [(4, 0), (4, 0), (2, 1)]);
+    }
+
+    // Sent before the last former reader has matched, it would not reach a BEST_EFFORT one.
+    #[test]
+    fn an_unsent_sample_of_a_former_process_waits_for_its_readers() {
+      let of = |id: u8| {
+        let reader = EntityId::new([0, 0, 2], EntityKind::READER_WITH_KEY_USER_DEFINED);
+        GUID::new(GuidPrefix::new(&[id; 12]), reader)
+      };
+      let sample = |number| crate::ContinuedSample {
+        number,
+        payload: bytes::Bytes::from_static(&[0; 8]),
+        encoding: RepresentationIdentifier::CDR_LE,
+        encoding_options: [0, 0],
+        source_timestamp: None,
+      };
+      let continuing = || {
+        let f = keep_last_continuing(crate::ContinuedWriter {
+          samples: [40, 41].map(sample).into(),
+          readers: vec![of(2), of(3)],
+          ..crate::ContinuedWriter::after(41)
+        });
+        f.writer.set_last_sent(SequenceNumber::new(40));
+        f
+      };
+      let sent = |f: &mut Fixture| {
+        f.writer.process_pending();
+        i64::from(f.writer.last_sent())
+      };
+      let mut f = continuing();
+      assert_eq!((sent(&mut f), f.writer.has_unsent()), (40, true));
+      let qos = QosPolicyBuilder::new().reliability(Reliability::BestEffort).build();
+      f.writer.update_reader_proxy(&RtpsReaderProxy::new(of(3), qos.clone(), false), &qos);
+      assert_eq!(sent(&mut f), 41);
+
+      // What is written meanwhile does not wait.
+      let mut f = continuing();
+      write_with(&f, WriteOptions::default(), 1, 8);
+      assert_eq!(sent(&mut f), 42);
     }
 
     // A message of a RELIABLE Writer ends with a HEARTBEAT, whose number shows that it was built.

@@ -71,6 +71,8 @@ struct Inner {
   // lack is kept, until then at most.
   former_readers: BTreeSet<GUID>,
   former_readers_until: Option<Instant>,
+  // The last sample of that writer.
+  former_last: SequenceNumber,
 
   // What each matched reader was offered and has acknowledged.
   readers: BTreeMap<GUID, Arc<ReaderProgress>>,
@@ -277,6 +279,7 @@ impl WriterSendBuffer {
           written_bytes: 0,
           former_readers: BTreeSet::new(),
           former_readers_until: None,
+          former_last: SequenceNumber::zero(),
           readers: BTreeMap::new(),
           left_overrun: 0,
           early: None,
@@ -356,6 +359,7 @@ impl WriterSendBuffer {
       inner.withdrawn_total = inner.withdrawn.len() as u64;
       inner.former_readers = continued.readers.into_iter().collect();
       inner.former_readers_until = Some(Instant::now() + FORMER_READERS_MATCH_WITHIN);
+      inner.former_last = highest;
     }
     shared.on_number = Some(continued.on_number);
     self
@@ -365,6 +369,18 @@ impl WriterSendBuffer {
   pub fn has_unsent(&self) -> bool {
     let inner = self.shared.inner.lock().unwrap();
     self.shared.direct_send.last_sent() < inner.last_seq
+  }
+
+  /// Whether samples of a former writer wait until its readers have matched: sent before, they would
+  /// reach no reader, and a BEST_EFFORT one never requests them. They do not wait any more when
+  /// something else is written.
+  pub fn holds_unsent(&self) -> bool {
+    let inner = self.shared.inner.lock().unwrap();
+    let is_waiting = !inner.former_readers.is_empty()
+      && inner.former_readers_until.is_some_and(|until| Instant::now() < until);
+    is_waiting
+      && inner.last_seq == inner.former_last
+      && self.shared.direct_send.last_sent() < inner.last_seq
   }
 
   fn begin_after(shared: &mut Shared, highest: SequenceNumber) {
@@ -1211,7 +1227,9 @@ mod tests {
     buf.set_acked_frontier(Some(number(41)));
     buf.release_acknowledged(number(41));
     assert_eq!(buf.retained_len(), 4, "another former reader may lack them");
+    assert!(buf.holds_unsent());
     assert_eq!(offered(2), number(37));
+    assert!(buf.has_unsent() && !buf.holds_unsent(), "all former readers have matched");
     buf.release_acknowledged(number(41));
     assert_eq!(buf.retained_len(), 1);
   }
