@@ -37,9 +37,9 @@ pub(super) struct FormerSamples {
 }
 
 impl FormerSamples {
-    /// Those that are in the log, for a writer that retains so many.
-    pub fn new(mut logged: Vec<(i64, u64)>, window: usize, unconfirmed: u64, now: MonotonicNs) -> Self {
-        logged.drain(..logged.len().saturating_sub(window));
+    /// The last ones in the log, at most so many.
+    pub fn new(mut logged: Vec<(i64, u64)>, most: usize, unconfirmed: u64, now: MonotonicNs) -> Self {
+        logged.drain(..logged.len().saturating_sub(most));
         Self {
             logged,
             collected: Vec::new(),

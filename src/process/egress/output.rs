@@ -34,8 +34,8 @@ use crate::model::{
 };
 use crate::policy::{CatchUp, SequenceOutcome, SequenceTracker, critical_drop};
 use crate::shm::{
-    BoardWriter, Boards, HistogramWriter, ProcessRole, QueueLimits, RouteChannel, SampleSubscriber,
-    ShmSample, Stage, SubscriberRole, TakeError,
+    BoardWriter, Boards, HistogramWriter, ProcessRole, QueueLimits, RouteChannel, SampleSubscriber, ShmError,
+    ShmNode, ShmSample, Stage, SubscriberRole, TakeError,
 };
 
 /// One output of a lane: the DDS writer of one route, and its account.
@@ -112,12 +112,26 @@ pub(super) struct Output {
 }
 
 impl Output {
+    /// Opens the queue of an output. Ingress delivers the retained samples to it when it publishes the next
+    /// sample.
+    pub fn open_queue(
+        node: &ShmNode,
+        settings: &Settings,
+        lane: &config::Lane,
+        route: usize,
+    ) -> Result<SampleSubscriber, ShmError> {
+        let limits = SubscriberRole::Lane(QueueLimits::of(lane));
+        SampleSubscriber::open(node, &RouteChannel::of(settings, route), limits, true)
+    }
+
+    /// Opens an output that takes its samples from `queue`.
     pub fn open(
         role: &Role,
         participant: &mut Participant,
         settings: &Settings,
         lane_index: usize,
         output: &config::Output,
+        queue: SampleSubscriber,
     ) -> Result<Self, RoleError> {
         let lane = &settings.lanes[lane_index];
         let route = &settings.routes[output.route];
@@ -130,13 +144,13 @@ impl Output {
         let former_readers = FormerReaders::of(readers.get(), started_at);
         let unconfirmed = readers.get().unconfirmed(counters.get());
         let offer = Offer::of(lane, output.qos);
-        let former_samples = FormerSamples::new(logged, offer.window_samples, unconfirmed, started_at);
-        let subscriber = SampleSubscriber::open(
-            &role.node,
-            &RouteChannel::of(settings, output.route),
-            SubscriberRole::Lane(QueueLimits::of(lane)),
-            true,
-        )?;
+        let accounted = counters.get().accounted_number;
+        let unsent = logged.iter().filter(|(number, _)| *number > accounted).count();
+        // Fewer than the writer retains: to look at all 256 took 4 ms of the pause when a standby takes over.
+        let lacking = readers.get().lacking(counters.get());
+        let lacking = lacking.map_or(usize::MAX, |forwarded| forwarded as usize + unsent);
+        let most = offer.window_samples.min(lacking.max(1));
+        let former_samples = FormerSamples::new(logged, most, unconfirmed, started_at);
         let latched_offer = output.latched_qos.map(|qos| Offer::of(lane, qos));
         let catch_up = match lane.class() {
             TrafficClass::Critical => {
@@ -160,7 +174,7 @@ impl Output {
             overwrite_reason: overwrite_reason(&lane.forwarding),
             gap_reason: overwrite_reason(&lane.forwarding),
             mode: LaneMode::Normal,
-            subscriber,
+            subscriber: queue,
             writer: None,
             type_hash: TypeHash::UNKNOWN,
             has_keys: false,

@@ -92,6 +92,15 @@ impl OutputReaders {
         behind.map_or(0, |behind| behind.saturating_add(since))
     }
 
+    /// How many of the last samples that count as forwarded a RELIABLE reader may lack, as
+    /// [`unconfirmed`](Self::unconfirmed); `None` if that is not known: a matched reader may have no record, or
+    /// a reader of a former process has not matched since.
+    pub fn lacking(&self, counters: &LaneCounters) -> Option<u64> {
+        let is_full = self.iter().count() == self.records.len();
+        let is_known = !is_full && self.more_former == 0 && self.former().next().is_none();
+        is_known.then(|| self.unconfirmed(counters))
+    }
+
     /// The readers that are not matched, each with the policy.
     pub fn unmatched(&self) -> impl Iterator<Item = (Guid, UnmatchedPolicy)> {
         let used = self.unmatched.iter().filter(|record| record.reader != Guid::default());
@@ -148,5 +157,22 @@ mod tests {
         readers.forwarded = counters.forwarded;
         readers.records[1] = ReaderRecord { unacknowledged: 0, reliable: 1, ..readers.records[1] };
         assert_eq!(readers.unconfirmed(&counters), 0);
+    }
+
+    #[test]
+    fn what_readers_may_lack_is_not_known_without_a_record_of_each() {
+        let reader = Guid([1; 16]);
+        let record = ReaderRecord { reader, unacknowledged: 7, reliable: 1, ..ReaderRecord::default() };
+        let mut readers = OutputReaders { forwarded: 1_000, ..OutputReaders::default() };
+        readers.records[0] = record;
+        let counters = LaneCounters { forwarded: 1_020, readers: 1, ..LaneCounters::default() };
+        assert_eq!(readers.lacking(&counters), Some(27));
+        let more = OutputReaders { more_former: 1, ..readers };
+        assert_eq!(more.lacking(&counters), None);
+        let mut waiting = readers;
+        waiting.former[0] = reader;
+        assert_eq!(waiting.lacking(&counters), None);
+        readers.records.fill(record);
+        assert_eq!(readers.lacking(&counters), None);
     }
 }

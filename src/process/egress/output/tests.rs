@@ -43,7 +43,9 @@ impl Host {
 
     fn open(&mut self) -> Output {
         let output = &self.settings.lanes[self.lane].outputs[0];
-        Output::open(&self.role, &mut self.participant, &self.settings, self.lane, output).unwrap()
+        let lane = &self.settings.lanes[self.lane];
+        let queue = Output::open_queue(&self.role.node, &self.settings, lane, output.route).unwrap();
+        Output::open(&self.role, &mut self.participant, &self.settings, self.lane, output, queue).unwrap()
     }
 
     /// Changes what ingress publishes of the route.
