@@ -1,4 +1,5 @@
-//! Checks of the documents: links lead to files, numbers of decisions are unique, there is a changelog.
+//! Checks of the documents: links lead to files, promises name their tests, numbers of decisions are unique,
+//! there is a changelog.
 
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
@@ -169,6 +170,53 @@ fn tests_by_file(text: &str) -> Vec<(&str, &str)> {
     tests
 }
 
+/// The cells of each row of a page's tables, without the heads.
+fn rows(page: &str) -> Vec<Vec<&str>> {
+    let mut is_below_head = false;
+    let mut rows = Vec::new();
+    for line in page.lines() {
+        let cells = line.strip_prefix('|').and_then(|line| line.strip_suffix('|'));
+        match cells {
+            Some(cells) if cells.starts_with("---") => is_below_head = true,
+            Some(cells) if is_below_head => rows.push(cells.split('|').map(str::trim).collect()),
+            Some(_) => {}
+            None => is_below_head = false,
+        }
+    }
+    rows
+}
+
+/// What is wrong with a row of docs/promises.md, which has the cells promise, test and mutation. `mutations`
+/// are rows of docs/mutations.md, with the cells place, mutation and test that failed.
+fn bad_promise(row: &[&str], mutations: &[Vec<&str>]) -> Option<String> {
+    let [promise, tests, mutation] = row else {
+        return Some(format!("{} cells instead of 3: {}", row.len(), row.join(" | ")));
+    };
+    let tests = tests_by_file(tests);
+    if tests.is_empty() {
+        return Some(format!("no test: {promise}"));
+    }
+    let is_named = |name: &str| tests.iter().any(|(_, test)| *test == name);
+    let has_failed = mutations.iter().any(|row| match row[..] {
+        [_, broken, failed] => {
+            broken == *mutation && tests_by_file(failed).iter().any(|(_, test)| is_named(test))
+        }
+        _ => false,
+    });
+    let is_known = mutation.is_empty() || has_failed;
+    (!is_known).then(|| format!("none of its tests has failed for '{mutation}': {promise}"))
+}
+
+#[test]
+fn each_promise_has_a_test_and_a_mutation_only_if_the_test_noticed_it() {
+    let read = |page: &str| std::fs::read_to_string(root().join(page)).unwrap();
+    let (promises, mutations) = (read("docs/promises.md"), read("docs/mutations.md"));
+    let (promises, mutations) = (rows(&promises), rows(&mutations));
+    assert!(promises.len() > 100 && mutations.len() > 100, "{} and {}", promises.len(), mutations.len());
+    let bad: Vec<String> = promises.iter().filter_map(|row| bad_promise(row, &mutations)).collect();
+    assert!(bad.is_empty(), "{}", bad.join("\n"));
+}
+
 #[test]
 fn every_file_and_test_that_the_pages_of_rustdds_and_of_promises_name_is_there() {
     let read = |file: &str| {
@@ -178,14 +226,14 @@ fn every_file_and_test_that_the_pages_of_rustdds_and_of_promises_name_is_there()
         };
         std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
     };
-    for page in ["docs/rustdds-changes.md", "docs/promises.md"] {
-        let page = std::fs::read_to_string(root().join(page)).unwrap();
-        for line in page.lines() {
-            files_and_functions(line).0.iter().filter(|file| file.ends_with(".rs")).for_each(|file| {
-                read(file);
-            });
-        }
-        let tests = tests_by_file(&page);
+    let [changes, promises] = ["docs/rustdds-changes.md", "docs/promises.md"].map(read);
+    for line in changes.lines().chain(promises.lines()) {
+        files_and_functions(line).0.iter().filter(|file| file.ends_with(".rs")).for_each(|file| {
+            read(file);
+        });
+    }
+    let promised = rows(&promises).into_iter().filter_map(|row| row.get(1).copied()).flat_map(tests_by_file);
+    for tests in [tests_by_file(&changes), promised.collect()] {
         assert!(tests.len() > 30, "{} tests", tests.len());
         for (file, test) in tests {
             assert!(read(file).contains(&format!("fn {test}(")), "no test {test} in {file}");
@@ -238,4 +286,22 @@ fn dead_links_and_bad_records_are_found() {
     );
     assert_eq!(bad_records(&["1-a.md"]), ["1-a.md is not NNNN-words.md"]);
     assert!(bad_records(&["0001-a.md", "0002-b.md"]).is_empty());
+}
+
+#[test]
+fn bad_promises_are_found() {
+    let page = "| a | b |\n|---|---|\n| `x.rs` | `!=` | `a_test_of_it`, then more |\n\n| no | row |\n";
+    let mutations = rows(page);
+    assert_eq!(mutations, [["`x.rs`", "`!=`", "`a_test_of_it`, then more"]]);
+    let bad = |line: &str| bad_promise(&rows(&format!("|---|\n{line}"))[0], &mutations);
+    assert_eq!(bad("| p | `x.rs` `a_test_of_it` | `!=` |"), None);
+    assert_eq!(bad("| p | `x.rs` `another_test_of_it` | |"), None);
+    assert_eq!(bad("| p | `x.rs` | |").unwrap(), "no test: p");
+    assert_eq!(
+        bad("| p | `x.rs` `a_test_of_it` |").unwrap(),
+        "2 cells instead of 3: p | `x.rs` `a_test_of_it`"
+    );
+    for other in ["| p | `x.rs` `another_test_of_it` | `!=` |", "| p | `x.rs` `a_test_of_it` | `==` |"] {
+        assert!(bad(other).unwrap().starts_with("none of its tests has failed for "), "{other}");
+    }
 }
