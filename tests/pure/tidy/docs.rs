@@ -1,12 +1,12 @@
-//! Checks of the documents: links lead to files, promises name their tests, numbers of decisions are unique,
-//! there is a changelog.
+//! Checks of the documents: links lead to files, promises and mutations name tests, numbers of decisions are
+//! unique, there is a changelog.
 
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 
 use support::root;
 
-use super::source::{Rust, files};
+use super::source::{Rust, SourceFile, files};
 
 /// Links of a page that lead nowhere. `exists` answers for paths from the root of the project.
 fn dead_links(path: &str, text: &str, exists: &dyn Fn(&Path) -> bool) -> Vec<String> {
@@ -217,6 +217,52 @@ fn each_promise_has_a_test_and_a_mutation_only_if_the_test_noticed_it() {
     assert!(bad.is_empty(), "{}", bad.join("\n"));
 }
 
+/// What is wrong with the test files that docs/mutations.md names: each has a row of a mutation, or else one
+/// with the reason for having none.
+fn bad_test_files(page: &str, files: &[&str]) -> Vec<String> {
+    let Some((with, without)) = page.split_once("\n## Test files without a mutation\n") else {
+        return vec!["no section for the test files without a mutation".to_owned()];
+    };
+    let (with, without) = (rows(with), rows(without));
+    let names = |rows: &[Vec<&str>], file: &str| rows.iter().any(|row| row[0] == format!("`{file}`"));
+    let mut bad = Vec::new();
+    for file in files {
+        match (names(&with, file), names(&without, file)) {
+            (false, false) => bad.push(format!("{file} has neither a mutation nor a reason for having none")),
+            (true, true) => bad.push(format!("{file} has a mutation: remove it from those without one")),
+            (true, false) | (false, true) => {}
+        }
+    }
+    for row in without {
+        if !files.iter().any(|file| row[0] == format!("`{file}`")) {
+            bad.push(format!("{} is no test file", row[0]));
+        }
+        if row.get(1).is_none_or(|reason| reason.is_empty()) {
+            bad.push(format!("{} has no reason", row[0]));
+        }
+    }
+    bad
+}
+
+#[test]
+fn every_test_file_has_a_mutation_or_a_reason_for_having_none() {
+    let found: Vec<SourceFile> = ["tests", "crates"].iter().flat_map(|folder| files(folder, "rs")).collect();
+    let is_program = |path: &str| path.starts_with("tests/") || path.split('/').nth(2) == Some("tests");
+    let tests: Vec<&str> = found
+        .iter()
+        .filter(|file| is_program(&file.path) && file.text.contains("#[test]"))
+        .map(|file| file.path.as_str())
+        .collect();
+    for known in
+        ["tests/testbed.rs", "tests/dds/cli.rs", "tests/pure/tidy/docs.rs", "crates/eval/tests/eval.rs"]
+    {
+        assert!(tests.contains(&known), "{known} is not in {tests:?}");
+    }
+    let page = std::fs::read_to_string(root().join("docs/mutations.md")).unwrap();
+    let bad = bad_test_files(&page, &tests);
+    assert!(bad.is_empty(), "{}", bad.join("\n"));
+}
+
 #[test]
 fn every_file_and_test_that_the_pages_of_rustdds_and_of_promises_name_is_there() {
     let read = |file: &str| {
@@ -304,4 +350,19 @@ fn bad_promises_are_found() {
     for other in ["| p | `x.rs` `another_test_of_it` | `!=` |", "| p | `x.rs` `a_test_of_it` | `==` |"] {
         assert!(bad(other).unwrap().starts_with("none of its tests has failed for "), "{other}");
     }
+}
+
+#[test]
+fn bad_test_files_are_found() {
+    let with = "|---|\n| `tests/a.rs` | x | y |\n";
+    let page = &format!("{with}\n## Test files without a mutation\n\n|---|\n| `tests/b.rs` | why |\n");
+    assert!(bad_test_files(page, &["tests/a.rs", "tests/b.rs"]).is_empty());
+    let bad = |page: &str, files: &[&str]| bad_test_files(page, files).join("; ");
+    let more = ["tests/a.rs", "tests/b.rs", "tests/c.rs"];
+    assert_eq!(bad(page, &more), "tests/c.rs has neither a mutation nor a reason for having none");
+    assert_eq!(bad(page, &["tests/a.rs"]), "`tests/b.rs` is no test file");
+    let both = page.replace("tests/b", "tests/a");
+    assert_eq!(bad(&both, &["tests/a.rs"]), "tests/a.rs has a mutation: remove it from those without one");
+    assert_eq!(bad(&page.replace("why", ""), &more[..2]), "`tests/b.rs` has no reason");
+    assert_eq!(bad("", &more[..1]), "no section for the test files without a mutation");
 }
