@@ -145,7 +145,7 @@ fn a_backlog_is_read_while_its_slots_are_written_again() {
             }
             reads
         });
-        // A read that lasts longer than 50 samples returns none: on a busy machine that can be every one of 100,000.
+        // A read that lasts longer than 50 samples returns none: on a busy machine each one did.
         let mut sequence = 0;
         while sequence < 100_000 || samples.load(Ordering::Relaxed) == 0 {
             sequence += 1;
