@@ -513,7 +513,7 @@ pub struct Security {
     pub replay_window_ms: u64,
     /// The most probe requests or responses of one sender that are processed per second.
     pub max_probe_rate_hz: u32,
-    /// Whether an override may name a subscriber by its node name.
+    /// Without effect; for files of the original package.
     pub allow_legacy_node_name_overrides: bool,
 }
 

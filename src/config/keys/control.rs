@@ -134,8 +134,9 @@ pub(super) const ROWS: &[Row] = &[
         "With `enable_probe_hmac`: control messages that are not authentic are refused (`default_deny`), \
          accepted and logged (`permissive`), or accepted (`off`).",
     ),
-    reloads(&["security.allow_legacy_node_name_overrides"], Flag, "`true`")
-        .doc("Whether an override may name a subscriber by its node name."),
+    reloads(&["security.allow_legacy_node_name_overrides"], Flag, "`true`").doc(
+        "Without effect: responses have no node name. The key exists for files of the original package.",
+    ),
     reloads(&["security.enable_probe_hmac"], Flag, "`false`").doc(
         "Whether probes and responses are signed ([protocol](../docs/probe-protocol.md)). Needs a secret \
          that control and every responder share. Without this key nothing is signed or checked, in any \

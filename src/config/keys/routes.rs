@@ -144,7 +144,10 @@ pub(super) const ROWS: &[Row] = &[
         Whole(1, 86_400_000, " ms"),
         "infinite",
     )
-    .doc("LIFESPAN: the age at which a writer discards a sample. An input has none."),
+    .doc(
+        "LIFESPAN: the age at which subscribers discard a sample. A critical lane that catches up leaves it \
+         out. An input has none.",
+    ),
     restarts(qos!("deadline_ms"), Whole(1, 86_400_000, " ms"), "infinite")
         .doc("DEADLINE: the longest time between two samples."),
     restarts(&["topic_qos_profiles.<topic>.<lane>"], Other("a name in `qos_profiles`"), "none")
