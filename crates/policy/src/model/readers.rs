@@ -93,8 +93,8 @@ impl OutputReaders {
     }
 
     /// How many of the last samples that count as forwarded a RELIABLE reader may lack, as
-    /// [`unconfirmed`](Self::unconfirmed); `None` if that is not known: a matched reader may have no record, or
-    /// a reader of a former process has not matched since.
+    /// [`unconfirmed`](Self::unconfirmed); `None` if that is not known: a matched reader may have no record,
+    /// or a reader of a former process has not matched since.
     pub fn lacking(&self, counters: &LaneCounters) -> Option<u64> {
         let is_full = self.iter().count() == self.records.len();
         let is_known = !is_full && self.more_former == 0 && self.former().next().is_none();
