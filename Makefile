@@ -64,17 +64,19 @@ fuzz:
 	scripts/fuzz.sh $(FUZZ_SECONDS)
 
 # What takes hours: each fuzz target for SOAK_FUZZ_SECONDS, chaos for SOAK_CHAOS_SECONDS, killed and stopped processes
-# with standbys for SOAK_HITLESS_SECONDS, outages of SOAK_OUTAGE_SECONDS of the subscribers' link and of the bridge's, and
-# memory over time under load for SOAK_TIME.
+# with standbys for SOAK_HITLESS_SECONDS, SOAK_VISITORS participants that come and go, outages of SOAK_OUTAGE_SECONDS of the
+# subscribers' link and of the bridge's, and memory over time under load for SOAK_TIME.
 SOAK_FUZZ_SECONDS ?= 600
 SOAK_CHAOS_SECONDS ?= 1800
 SOAK_HITLESS_SECONDS ?= 3600
 SOAK_OUTAGE_SECONDS ?= 300
-SOAK_TIME ?= 1h
+SOAK_VISITORS ?= 9500
+SOAK_TIME ?= 70m
 soak:
 	scripts/fuzz.sh $(SOAK_FUZZ_SECONDS)
 	ADAPTIVE_BRIDGE_TEST_CHAOS_S=$(SOAK_CHAOS_SECONDS) cargo test --locked --test hosts -- --nocapture chaos::
 	ADAPTIVE_BRIDGE_TEST_HITLESS_S=$(SOAK_HITLESS_SECONDS) cargo test --locked --test hosts -- --nocapture standby::long
+	ADAPTIVE_BRIDGE_TEST_VISITORS=$(SOAK_VISITORS) cargo test --locked --test hosts -- --nocapture churn::
 	ADAPTIVE_BRIDGE_TEST_OUTAGE_S=$(SOAK_OUTAGE_SECONDS) cargo test --locked --test hosts -- --nocapture from_a_long_outage
 	cargo bench --locked -- --soak $(SOAK_TIME)
 

@@ -288,7 +288,7 @@ fn memory_is_judged_by_its_slope_if_the_interval_is_narrow_enough() {
     };
     assert_eq!(judged(0.0, 3_600.0), ("flat".to_owned(), 0));
     // 0.2 KiB/s are 720 KiB in an hour, 0.4 KiB/s 1,440.
-    assert_eq!(judged(0.2, 3_600.0), ("flat".to_owned(), 0));
+    assert_eq!(judged(0.2, 3_600.0), ("grows slowly".to_owned(), 0));
     assert_eq!(judged(0.4, 3_600.0), ("**grows**".to_owned(), 1));
     // In a minute even 4 KiB/s are less than an allocator takes at once.
     assert_eq!(judged(4.0, 60.0), ("too short to tell".to_owned(), 0));

@@ -483,6 +483,7 @@ pub fn soak(summary: &Summary) -> Option<String> {
             match trend {
                 _ if !is_memory => String::new(),
                 targets::Trend::Flat => "flat".to_owned(),
+                targets::Trend::Slow => "grows slowly".to_owned(),
                 targets::Trend::Grows => "**grows**".to_owned(),
                 targets::Trend::TooShort => "too short to tell".to_owned(),
             },

@@ -130,7 +130,7 @@ pub fn table(summary: &Summary) -> Option<String> {
                 _ => slope(per_hour) + " KiB/h",
             },
             met: match trend {
-                Trend::Flat => Some(true),
+                Trend::Flat | Trend::Slow => Some(true),
                 Trend::Grows => Some(false),
                 Trend::TooShort => None,
             },
@@ -275,8 +275,11 @@ const WARM_UP: f64 = 0.2;
 /// Whether memory grows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Trend {
-    /// It grows by at most [`MAX_KIB_PER_HOUR`], or by less than an allocator takes at once.
+    /// It does not grow: the interval of the slope begins at 0 or below, or the growth is less than an
+    /// allocator takes at once.
     Flat,
+    /// It grows by at most [`MAX_KIB_PER_HOUR`].
+    Slow,
     /// It grows by more.
     Grows,
     /// No growth was found, but the run was too short to find one.
@@ -297,7 +300,11 @@ pub fn trend(series: &SoakSeries) -> (Trend, Option<Growth>) {
     let Some(per_hour) = growth(&by_hour) else { return (Trend::TooShort, None) };
     let hours = end / 3_600.0 - by_hour.first().map_or(0.0, |point| point.0);
     let trend = if per_hour.slope * hours > ALLOCATION_STEP_KIB {
-        if per_hour.slope > MAX_KIB_PER_HOUR { Trend::Grows } else { Trend::Flat }
+        match per_hour {
+            Growth { slope, .. } if slope > MAX_KIB_PER_HOUR => Trend::Grows,
+            Growth { low, .. } if low > 0.0 => Trend::Slow,
+            _ => Trend::Flat,
+        }
     } else if ALLOCATION_STEP_KIB / hours > MAX_KIB_PER_HOUR {
         Trend::TooShort
     } else {
