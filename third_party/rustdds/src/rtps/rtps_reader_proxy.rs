@@ -297,8 +297,8 @@ impl RtpsReaderProxy {
     false
   }
 
-  /// A joining reader of the writer that this one continues, which has lost its state of that
-  /// one, gets nothing from before it was matched.
+  /// A reader of the writer that this one continues, which has lost its state of that one, gets
+  /// nothing from before it was matched. To be called with its first ACKNACK.
   pub fn begin_anew_if_reset(&mut self, acknack: &AckNack) {
     let one = SequenceNumber::from(1);
     if let Some(progress) = self.progress.as_ref() {

@@ -1516,6 +1516,10 @@ impl Writer {
             );
             return;
           }
+          let is_first = reader_proxy.last_acknack_count.is_none();
+          if is_first {
+            reader_proxy.begin_anew_if_reset(an);
+          }
           reader_proxy.last_acknack_count = Some(an.count);
           reader_proxy.last_acknack_base = an.reader_sn_state.base();
 
@@ -1600,11 +1604,12 @@ impl Writer {
           }
 
           if reader_proxy.ends_joining(an) {
-            reader_proxy.begin_anew_if_reset(an);
             self.start_sending_to(reader_guid);
           } else if reader_proxy.is_joining() {
             self.offer_to_new_reader(reader_guid);
             return;
+          } else if is_first {
+            self.repair_what_was_lost_with_former(reader_guid);
           }
           let Some(reader_proxy) = self.readers.get_mut(&reader_guid) else {
             return;
@@ -2853,7 +2858,9 @@ impl Writer {
       && updated_reader_proxy.qos().is_reliable()
       && (!writer_keeps_history || updated_reader_proxy.qos().is_volatile())
       && !has_received_sibling
-      && new_guid.prefix != self.my_guid.prefix;
+      && new_guid.prefix != self.my_guid.prefix
+      // It knows this Writer from the former process.
+      && !send_buffer.is_former_reader(new_guid);
     self
       .readers
       .entry(updated_reader_proxy.remote_reader_guid)
@@ -2980,6 +2987,17 @@ impl Writer {
   fn offer_to_joining_readers(&self) {
     for joining in self.readers.values().filter(|rp| rp.is_joining()) {
       self.offer_to_new_reader(joining.remote_reader_guid);
+    }
+  }
+
+  // What a former process has sent and the reader has not received goes to it as a repair. Cyclone
+  // DDS requests it only 0.1 s after a HEARTBEAT.
+  fn repair_what_was_lost_with_former(&mut self, reader_guid: GUID) {
+    let first_retained = self.send_buffer.first_change_sequence_number();
+    let last = min(self.send_buffer.former_last(), self.last_sent());
+    if let Some(reader) = self.readers.get_mut(&reader_guid) {
+      let first = max(first_retained, reader.all_acked_before);
+      reader.request_changes(first..last.plus_1());
     }
   }
 
@@ -5089,11 +5107,7 @@ mod tests {
 
       for base in [0, 1] {
         let mut f = continuing();
-        let mut count = 0;
-        while f.writer.readers[&f.reader_guid].is_joining() {
-          count += 1;
-          acknowledge(&mut f, base, &[], count);
-        }
+        acknowledge(&mut f, base, &[], 1);
         assert_eq!(f.unsent(), 0, "nothing is sent again: {base}");
         assert_eq!(only_reader(&f).unacknowledged, 0);
         write(&f, 1, 8);

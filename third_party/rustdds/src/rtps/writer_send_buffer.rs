@@ -371,6 +371,16 @@ impl WriterSendBuffer {
     self.shared.direct_send.last_sent() < inner.last_seq
   }
 
+  /// Whether it was a reader of the former writer, and has not matched this one yet.
+  pub fn is_former_reader(&self, reader: GUID) -> bool {
+    self.shared.inner.lock().unwrap().former_readers.contains(&reader)
+  }
+
+  /// The last sample of the former writer; 0 if there was none.
+  pub fn former_last(&self) -> SequenceNumber {
+    self.shared.inner.lock().unwrap().former_last
+  }
+
   /// Whether samples of a former writer wait until its readers have matched: sent before, they would
   /// reach no reader, and a BEST_EFFORT one never requests them. They do not wait any more when
   /// something else is written.
