@@ -69,6 +69,29 @@ fn up_restarts_a_process_that_hangs_before_its_first_turn() {
     bed.end();
 }
 
+/// Without the watchdog, because it would kill the process before the test asks `up` to end.
+#[test]
+fn up_that_has_to_kill_a_process_at_its_end_fails_and_names_it() {
+    let test = "up_that_has_to_kill_a_process_at_its_end_fails_and_names_it";
+    let Some(mut bed) = Bed::start_without_watchdog(test, SCAN) else { return };
+    let role = "egress-noncritical";
+    let process = bed.pid(role);
+    std::thread::scope(|scope| {
+        // A thread of the test traces the hanging one until its process is dead. `up` continues a process in
+        // SIGSTOP, but not one that is traced.
+        scope.spawn(|| cause(Fault::Hang, process, thread(process, None)));
+        support::wait_until("a main thread that hangs", || {
+            std::fs::read_to_string(format!("/proc/{process}/stat")).is_ok_and(|stat| stat.contains(") t "))
+        });
+        let status = bed.up.terminate();
+        let log = bed.up.log();
+        assert_eq!(status.code(), Some(1), "{log}");
+        // A busy machine may keep others from ending in time, too.
+        let is_named = |line: &str| line.contains("did not end within 4500 ms") && line.contains(role);
+        assert!(log.lines().any(is_named), "{log}");
+    });
+}
+
 /// Turns off the grouping of processes by session, in which a busy process leaves others their share; until
 /// it is dropped.
 struct NoAutogroup(String);
