@@ -5,7 +5,7 @@ use std::process::Command;
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
-use support::bed::NO_STANDBYS;
+use support::bed::{NO_STANDBYS, outputs};
 use support::bridge::{Bridge, program};
 use support::process::{Process, signal};
 
@@ -73,6 +73,35 @@ fn the_service_of_a_standby_ends_if_the_configuration_has_none() {
         assert_eq!(output.status.code(), Some(3), "{role:?}: {stderr}");
         assert!(stderr.contains("no standby for this role"), "{stderr}");
     }
+}
+
+/// A process has an endpoint for each route to remove, and `up` kills those that have not ended in 4.5 s.
+#[test]
+fn up_with_sixty_routes_ends_its_processes_in_time() {
+    let route = |number| {
+        format!(
+            "  - {{id: scan{number}, input_topic: /scan{number}, message_type: sensor_msgs/msg/LaserScan, \
+             max_sample_bytes: 8192}}\n"
+        )
+    };
+    let topics: String = (0..60).map(route).collect();
+    let bridge = Bridge::new(&format!(
+        "instance: {{instance}}\nros: {{domain_id: 122}}\ntopics:\n{topics}\
+         shared_memory: {{root_path: {{folder}}/root}}\n{NO_STANDBYS}"
+    ));
+    // A busy machine may keep a process from ending in time, but hardly three times in a row.
+    let mut log = String::new();
+    let ends_in_time = (0..3).any(|_| {
+        let mut up = bridge.start("up");
+        let has_all_writers = |status: &Value| {
+            are_running(status) && outputs(status).filter(|output| output["topic"].is_string()).count() == 120
+        };
+        bridge.wait_status("all processes, and the writers of all routes", has_all_writers);
+        let status = up.terminate();
+        log = up.log();
+        status.success() && !log.contains("did not end in time")
+    });
+    assert!(ends_in_time, "{log}");
 }
 
 /// One that read another file than the other services would be a second bridge beside theirs.
