@@ -511,7 +511,7 @@ pub struct Security {
     pub secret: Option<SecretSource>,
     /// The largest age of a signed message.
     pub replay_window_ms: u64,
-    /// The most probe requests or responses of one sender that are processed per second.
+    /// The most probe requests, or responses to own probes, of one sender that are processed per second.
     pub max_probe_rate_hz: u32,
     /// Without effect; for files of the original package.
     pub allow_legacy_node_name_overrides: bool,

@@ -142,8 +142,11 @@ pub(super) const ROWS: &[Row] = &[
          that control and every responder share. Without this key nothing is signed or checked, in any \
          `trust_mode`.",
     ),
-    reloads(&["security.max_probe_rate_hz"], Whole(1, 10_000, " Hz, whole"), "20")
-        .doc("Probes and responses of one sender that are processed per second."),
+    reloads(&["security.max_probe_rate_hz"], Whole(1, 10_000, " Hz, whole"), "20").doc(
+        "Requests of one sender that a responder processes per second, and responses of one sender to its \
+             own probes that control does. Control decodes other messages, too, and refuses them; that has \
+             no such limit.",
+    ),
     reloads(&["security.hmac_secret"], Other("text"), "none").doc(
         "The shared secret itself; empty for none. Every user who can read the file has it: prefer one of \
          the next two. At most one of the three may be given.",
