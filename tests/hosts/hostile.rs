@@ -11,7 +11,7 @@ use support::netns::udp_ports;
 use support::peer::{Peer, Received, Sent};
 use support::rtps::Prefix;
 
-const ROLES: [&str; 3] = ["ingress", "egress-critical", "egress-noncritical"];
+const ROLES: [&str; 4] = ["ingress", "egress-critical", "egress-noncritical", "control"];
 
 /// A pseudo-random sequence that is reproducible from its seed (xorshift64*).
 pub(super) struct Random(pub(super) u64);
@@ -107,8 +107,19 @@ fn readers(status: &Value) -> impl Iterator<Item = &Value> {
     outputs(status).flat_map(|output| output["matched_readers"].as_array().unwrap()).map(|one| &one["guid"])
 }
 
+/// The malformed datagrams that each role has counted.
+fn malformed(bed: &Bed) -> [u64; ROLES.len()] {
+    let status = bed.bridge.status();
+    let processes = status["processes"].as_array().unwrap();
+    ROLES.map(|role| {
+        let process = processes.iter().find(|process| process["name"] == role);
+        let refused = process.and_then(|process| process["network_refusals"]["malformed_datagram"].as_u64());
+        refused.unwrap_or_else(|| panic!("{role}: {status}"))
+    })
+}
+
 /// Sends datagrams to the bridge from another host for some time, in part in the name of the participants
-/// `known`. Asserts that no process was restarted.
+/// `known`. Asserts that each process counted malformed ones and none was restarted.
 fn attack(bed: &Bed, seconds: u64, known: &[Prefix]) {
     let ports = udp_ports(bed.pid("ingress"));
     assert!(ports.contains(&7400) && ports.len() >= 8, "{ports:?}");
@@ -119,8 +130,10 @@ fn attack(bed: &Bed, seconds: u64, known: &[Prefix]) {
     let go_on = || Instant::now() < until;
     let sent = bed.host("slow").within(|| send(address, &ports, seed, known, go_on));
     assert!(sent > 10_000, "only {sent} datagrams were sent");
-    for role in ROLES {
+    for (role, malformed) in ROLES.into_iter().zip(malformed(bed)) {
         assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
+        println!("{role} counted {malformed} malformed of {sent} datagrams");
+        assert!(malformed > 0, "{role} counted no malformed datagram of {sent}");
     }
 }
 
@@ -148,6 +161,31 @@ pub(super) fn send(
         std::thread::sleep(Duration::from_millis(2));
     }
     sent
+}
+
+#[test]
+fn each_process_counts_each_kind_of_malformed_datagram() {
+    let Some(bed) = Bed::start("each_process_counts_each_kind_of_malformed_datagram", SCAN) else { return };
+    bed.up.wait_for_log("control is up");
+    let processes = bed.discovery_addresses();
+    let socket = bed.host("slow").udp_socket();
+    let header = [&b"RTPS\x02\x03\x01\x12"[..], &[7; 12]].concat();
+    let kinds = [
+        ("shorter than a header", header[..19].to_vec()),
+        ("not of RTPS", [&b"RTPQ"[..], &header[4..]].concat()),
+        ("a submessage without its end", [&header[..], &[0x15, 1, 0xff, 0]].concat()),
+    ];
+    for (kind, datagram) in kinds {
+        let before = malformed(&bed);
+        // Again until all count it, because the network may lose datagrams.
+        support::wait_until(format!("all processes to count a datagram that is {kind}"), || {
+            for process in &processes {
+                socket.send_to(&datagram, process).unwrap();
+            }
+            malformed(&bed).iter().zip(before).all(|(now, before)| *now > before)
+        });
+    }
+    bed.end();
 }
 
 /// Tests of a minute or more: `make test-long`.
