@@ -114,6 +114,11 @@ impl Cell {
         self.estimate(figure).map(|estimate| estimate.median)
     }
 
+    /// The largest value of a figure in any repetition.
+    pub fn max(&self, figure: impl Fn(&Measures) -> Option<f64>) -> Option<f64> {
+        self.measures.iter().filter_map(figure).max_by(f64::total_cmp)
+    }
+
     /// A quantile of the critical latency in milliseconds, as the median over repetitions.
     pub fn critical_ms(&self, q: f64) -> Option<f64> {
         self.median(|one| one.critical_ms.quantile(q))

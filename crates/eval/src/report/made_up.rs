@@ -26,6 +26,8 @@ pub struct MadeUp {
     pub tail_ms: f64,
     /// The number of samples in the middle of the run that the critical subscriber does not receive.
     pub lost: u64,
+    /// The number of publish calls at the end of the run that fail.
+    pub failed: u64,
     pub lane_bytes_per_s: u64,
     pub wire_bytes_per_s: u64,
     pub fragments_per_s: u64,
@@ -47,6 +49,7 @@ impl Default for MadeUp {
             latency_ms: 0.5,
             tail_ms: 0.9,
             lost: 0,
+            failed: 0,
             lane_bytes_per_s: 8_000,
             wire_bytes_per_s: 10_000,
             fragments_per_s: 0,
@@ -100,10 +103,11 @@ impl MadeUp {
         let manifest = self.manifest();
         let count = (f64::from(self.length_s) * self.rate_hz) as u64;
         let at = |seq: u64| (seq as f64 + 0.5) / self.rate_hz;
-        let attempts =
-            (0..count).map(|seq| Attempt { seq, at_s: at(seq), call_ms: 0.05, ok: true }).collect::<Vec<_>>();
+        let written = count - self.failed;
+        let attempt = |seq| Attempt { seq, at_s: at(seq), call_ms: 0.05, ok: seq < written };
+        let attempts: Vec<Attempt> = (0..count).map(attempt).collect();
         let lost = count / 2..count / 2 + self.lost;
-        let receptions = (0..count).filter(|seq| !lost.contains(seq)).map(|seq| {
+        let receptions = (0..written).filter(|seq| !lost.contains(seq)).map(|seq| {
             let latency_ms = if seq % 10 == 9 { self.tail_ms } else { self.latency_ms };
             Reception { seq, at_s: at(seq) + latency_ms / 1e3, latency_ms }
         });

@@ -48,6 +48,25 @@ fn h1_is_partly_confirmed_or_contradicted() {
     assert_eq!(finding(&baselines("as-run", 20.0, 12_000.0)[1..], 1).verdict, Verdict::NotTested);
 }
 
+#[test]
+fn h1_compares_with_the_clean_baseline_of_the_other_switch_if_there_is_no_other() {
+    let mut runs = baselines("as-run", 20.0, 12_000.0);
+    for run in &mut runs[1..] {
+        run.switch = "reassembling";
+    }
+    let found = finding(&runs, 1);
+    assert_eq!((found.verdict, found.criteria.len()), (Verdict::Confirmed, 6), "{found:?}");
+    assert!(found.because.contains("switch that reassembles fragments: rate"), "{}", found.because);
+    // That of the same switch comes first: its rate is as low.
+    let own = MadeUp { switch: "reassembling", rate_hz: 20.0, ..MadeUp::default() };
+    let found = finding(&[&runs[..], &[own]].concat(), 1);
+    assert_eq!(found.verdict, Verdict::Partly, "{found:?}");
+    assert!(found.because.contains("rate degraded at no level"), "{}", found.because);
+    // One of another library does not count.
+    runs[0].library = "cyclone";
+    assert_eq!(finding(&runs, 1).verdict, Verdict::NotTested);
+}
+
 /// All runs that H2 and H3 require.
 fn bridges() -> Vec<MadeUp> {
     let mut runs = Vec::new();
@@ -177,6 +196,23 @@ fn the_mechanism_follows_from_the_figures() {
     let text = mechanism(cell).unwrap();
     assert!(text.starts_with("The writer's history did not fill: at most"), "{text}");
     assert!(text.ends_with("The switch held no fragments, so it dropped nothing of the critical path."));
+    // Each number is the lost samples of a repetition, in which two publish calls of 600 fail.
+    for (lost, expected) in [
+        (&[0, 0, 0][..], "ms after they were written, and each one that the writer took."),
+        (&[1], "ms after they were written, and missed 1 that the writer took."),
+        (&[0, 0, 5], "ms after they were written, and missed 5 that the writer took."),
+        (&[1, 2, 5], "ms after they were written, and missed 8 that the writer took."),
+    ] {
+        let run = |&lost| MadeUp { scenario: "baseline_mild", lost, failed: 2, ..MadeUp::default() };
+        let all = results(&lost.iter().map(run).collect::<Vec<_>>());
+        let text = mechanism(all.cells().next().unwrap()).unwrap();
+        let calls = format!("0 of {} publish calls blocked and {} failed.", 600 * lost.len(), 2 * lost.len());
+        assert!(text.replace(',', "").contains(&calls), "{text}");
+        assert!(text.contains(expected), "{lost:?}: {text}");
+        // Five lost samples at 30 Hz are six periods without one.
+        let gap = if lost.contains(&5) { "for up to 0.2 s" } else { "for up to 0.1 s" };
+        assert!(text.contains(gap), "{lost:?}: {text}");
+    }
     // A lane's writer is BEST_EFFORT and holds no samples.
     let all = results(&bridges());
     assert!(all.cells().filter(|cell| cell.bridge).all(|cell| mechanism(cell).is_none()));
