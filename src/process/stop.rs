@@ -52,3 +52,36 @@ pub fn abort_on_panic() {
         std::process::abort();
     }));
 }
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::process::ExitStatusExt;
+    use std::process::Command;
+
+    use nix::sys::resource::{Resource, setrlimit};
+    use nix::sys::signal::Signal;
+
+    use super::*;
+
+    /// Set in the child process of the test.
+    const CHILD_VARIABLE: &str = "ADAPTIVE_BRIDGE_TEST_PANIC";
+
+    #[test]
+    fn a_panic_of_a_second_thread_ends_the_process_by_sigabrt() {
+        let name = "process::stop::tests::a_panic_of_a_second_thread_ends_the_process_by_sigabrt";
+        if std::env::var_os(CHILD_VARIABLE).is_some() {
+            // No dump of the memory.
+            setrlimit(Resource::RLIMIT_CORE, 0, 0).unwrap();
+            abort_on_panic();
+            let _ = std::thread::spawn(|| panic!("as the receiving thread")).join();
+            // Without the hook, the panic ends only its thread, and the process succeeds.
+            return;
+        }
+        let mut child = Command::new(std::env::current_exe().unwrap());
+        child.args(["--exact", name, "--nocapture"]).env(CHILD_VARIABLE, "1");
+        let output = child.output().unwrap();
+        assert_eq!(output.status.signal(), Some(Signal::SIGABRT as i32), "{output:?}");
+        let log = String::from_utf8_lossy(&output.stderr);
+        assert!(log.contains("as the receiving thread"), "{log}");
+    }
+}
