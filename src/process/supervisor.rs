@@ -313,7 +313,11 @@ fn stop_all(children: &mut [Supervised]) -> Vec<String> {
     let deadline = clock::monotonic().plus_ms(GRACE_MS);
     while children.iter_mut().any(|child| !child.has_ended()) {
         if clock::monotonic() >= deadline {
-            for child in children.iter_mut().filter(|child| child.process.is_some()) {
+            // The condition of the loop has not asked those after the first one that runs.
+            for child in children.iter_mut() {
+                if child.has_ended() {
+                    continue;
+                }
                 warn!(child = child.name, "did not end in time after SIGTERM; killed");
                 killed.push(child.name.clone());
                 child.signal(&[Signal::SIGKILL]);

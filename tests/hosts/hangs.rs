@@ -73,8 +73,22 @@ fn up_restarts_a_process_that_hangs_before_its_first_turn() {
 #[test]
 fn up_that_has_to_kill_a_process_at_its_end_fails_and_names_it() {
     let test = "up_that_has_to_kill_a_process_at_its_end_fails_and_names_it";
-    let Some(mut bed) = Bed::start_without_watchdog(test, SCAN) else { return };
-    let role = "egress-noncritical";
+    let role = "ingress";
+    // A busy machine may keep others from ending in time, too, but hardly three times in a row.
+    for attempt in 1..=3 {
+        let Some(bed) = Bed::start_without_watchdog(test, SCAN) else { return };
+        let killed = end_while_it_hangs(bed, role);
+        assert!(killed.iter().any(|name| name == role), "{killed:?}");
+        if killed.len() == 1 {
+            break;
+        }
+        assert!(attempt < 3, "{killed:?}");
+    }
+}
+
+/// Ends a bridge in which the main thread of a process hangs; returns the names of the processes that `up`
+/// killed.
+fn end_while_it_hangs(mut bed: Bed, role: &str) -> Vec<String> {
     let process = bed.pid(role);
     std::thread::scope(|scope| {
         // A thread of the test traces the hanging one until its process is dead. `up` continues a process in
@@ -86,10 +100,10 @@ fn up_that_has_to_kill_a_process_at_its_end_fails_and_names_it() {
         let status = bed.up.terminate();
         let log = bed.up.log();
         assert_eq!(status.code(), Some(1), "{log}");
-        // A busy machine may keep others from ending in time, too.
-        let is_named = |line: &str| line.contains("did not end within 4500 ms") && line.contains(role);
-        assert!(log.lines().any(is_named), "{log}");
-    });
+        let killed = "did not end within 4500 ms of SIGTERM and were killed: ";
+        let names = log.lines().find_map(|line| Some(line.split_once(killed)?.1));
+        names.unwrap_or_else(|| panic!("{log}")).split(", ").map(str::to_owned).collect()
+    })
 }
 
 /// Turns off the grouping of processes by session, in which a busy process leaves others their share; until
