@@ -695,6 +695,10 @@ impl DPEventLoop {
         DpTimerEvent::Writer { entity_id, event } => {
           if let Some(writer) = self.writers.get_mut(&entity_id) {
             writer.handle_timed_event(event);
+            // They may have waited long enough for the readers of a former writer.
+            if writer.has_unsent() {
+              self.writers_with_more.insert(entity_id);
+            }
           } else if !preparing_to_stop {
             trace!("Timed event for unknown writer {entity_id:?}");
           }

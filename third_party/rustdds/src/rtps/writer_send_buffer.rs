@@ -71,8 +71,9 @@ struct Inner {
   // lack is kept, until then at most.
   former_readers: BTreeSet<GUID>,
   former_readers_until: Option<Instant>,
-  // The last sample of that writer.
+  // The last sample of that writer, and until when samples that it had not sent wait at most.
   former_last: SequenceNumber,
+  unsent_wait_until: Option<Instant>,
 
   // What each matched reader was offered and has acknowledged.
   readers: BTreeMap<GUID, Arc<ReaderProgress>>,
@@ -148,6 +149,9 @@ impl Early {
 
 // They are known from the journal of discovery, and match with the writer's creation.
 const FORMER_READERS_MATCH_WITHIN: StdDuration = StdDuration::from_secs(5);
+
+// For how long samples that the former writer had not sent wait for them at most.
+const UNSENT_WAIT: StdDuration = StdDuration::from_secs(1);
 
 // A reader that acknowledges nothing may ask for a number for as long as it is matched;
 // without the record it counts as one more that the reader missed.
@@ -280,6 +284,7 @@ impl WriterSendBuffer {
           former_readers: BTreeSet::new(),
           former_readers_until: None,
           former_last: SequenceNumber::zero(),
+          unsent_wait_until: None,
           readers: BTreeMap::new(),
           left_overrun: 0,
           early: None,
@@ -360,6 +365,7 @@ impl WriterSendBuffer {
       inner.former_readers = continued.readers.into_iter().collect();
       inner.former_readers_until = Some(Instant::now() + FORMER_READERS_MATCH_WITHIN);
       inner.former_last = highest;
+      inner.unsent_wait_until = Some(Instant::now() + UNSENT_WAIT);
     }
     shared.on_number = Some(continued.on_number);
     self
@@ -382,12 +388,12 @@ impl WriterSendBuffer {
   }
 
   /// Whether samples of a former writer wait until its readers have matched: sent before, they would
-  /// reach no reader, and a BEST_EFFORT one never requests them. They do not wait any more when
-  /// something else is written.
+  /// reach no reader, and a BEST_EFFORT one never requests them. They wait until something else is
+  /// written, `UNSENT_WAIT` at most.
   pub fn holds_unsent(&self) -> bool {
     let inner = self.shared.inner.lock().unwrap();
     let is_waiting = !inner.former_readers.is_empty()
-      && inner.former_readers_until.is_some_and(|until| Instant::now() < until);
+      && inner.unsent_wait_until.is_some_and(|until| Instant::now() < until);
     is_waiting
       && inner.last_seq == inner.former_last
       && self.shared.direct_send.last_sent() < inner.last_seq

@@ -60,10 +60,10 @@ fn a_killed_process_leaves_its_samples_with_their_numbers() {
         next.collect_former(&mut host.participant, &mut host.arena);
         !next.collects_former()
     });
+    assert!(next.take().is_none() && next.count_sent(), "the former reader has not matched");
     wait_until("the sample that was not counted", || {
         next.writer.as_ref().is_some_and(|writer| writer.sent_through() == 7)
     });
-    assert!(next.take().is_none() && next.count_sent(), "the former reader has not matched");
     next.end_hold();
     assert!(!next.count_sent());
     let counters = *next.counters.get();
