@@ -43,7 +43,9 @@ config)
     ;;
 accounting)
     # The counters of both processes, and the boards on which they are. tests/dds and tests/shm run the bridge.
-    set -- --package adaptive-bridge --file src/shm/board.rs --file 'src/process/egress/{output,unsent}.rs' \
+    set -- --package adaptive-bridge --file src/shm/board.rs \
+        --file 'src/process/egress/{former_samples,output,unsent}.rs' \
+        --file 'src/process/egress/output/{catch_up,former,matching,missing}.rs' \
         --file 'src/process/ingress/{input,publishers}.rs' "$@" -- \
         --lib --test shm --test dds
     ;;
