@@ -574,4 +574,10 @@ mod tests {
         let counts: Vec<_> = since.buckets().filter(|&(_, count)| count > 0).collect();
         assert!(matches!(counts[..], [(edge, 2)] if (2_000_000..2_130_000).contains(&edge)), "{counts:?}");
     }
+
+    #[test]
+    fn a_standby_has_a_cause_once_it_has_taken_over() {
+        let cause = |cause| StandbyRecord { cause, ..StandbyRecord::default() }.cause();
+        assert_eq!([0, 1, 3].map(cause), [None, Some(TakeOverCause::Ended), Some(TakeOverCause::HandedOver)]);
+    }
 }

@@ -235,8 +235,18 @@ mod tests {
         // With a short limit, no pause by itself reaches it.
         watch.set_limit_ms(400);
         let hung_at =
-            (1..).find(|hour| watch.has_hung(at(3_600_300), false, at(3_600_500 + hour * 3_600_000)));
+            (1..10).find(|hour| watch.has_hung(at(3_600_300), false, at(3_600_500 + hour * 3_600_000)));
         assert_eq!(hung_at, Some(4));
+    }
+
+    #[test]
+    fn a_changed_limit_holds_from_the_next_check_on() {
+        let at = |ms| MonotonicNs(1).plus_ms(ms);
+        let mut watch = HangWatch::new(2_000, at(0));
+        assert!(!watch.has_hung(at(50), false, at(100)));
+        watch.set_limit_ms(400);
+        let hung_ms = (150..5_000).step_by(50).find(|ms| watch.has_hung(at(50), false, at(*ms)));
+        assert_eq!(hung_ms, Some(500));
     }
 
     #[test]
@@ -245,7 +255,7 @@ mod tests {
         let checks = |starved: fn(u64) -> bool| {
             let mut watch = HangWatch::new(2_000, at(0));
             assert!(!watch.has_hung(at(100), true, at(250)));
-            (500..).step_by(250).find(|ms| watch.has_hung(at(100), starved(*ms), at(*ms))).unwrap()
+            (500..60_000).step_by(250).find(|ms| watch.has_hung(at(100), starved(*ms), at(*ms))).unwrap()
         };
         assert_eq!(checks(|_| false), 2_250);
         assert_eq!(checks(|ms| ms <= 10_250), 12_250, "10 s of waiting for a CPU do not count");
