@@ -119,4 +119,17 @@ mod tests {
         assert_eq!(numbers((1..=3).map(|number| samples.push(unsent(number)))), [None, None, Some(1)]);
         assert_eq!((samples.len(), samples.bytes()), (2, 14));
     }
+
+    #[test]
+    fn samples_that_were_sent_are_counted_with_their_bytes() {
+        let mut counters = LaneCounters::default();
+        for (number, by_reference) in [(4, true), (5, false), (3, true)] {
+            let written_at = MonotonicNs(10 * number as u64);
+            let sample = Forwarded { by_reference, caught_up: by_reference, written_at, ..unsent(number) };
+            count_forwarded(&mut counters, &sample);
+        }
+        assert_eq!((counters.forwarded, counters.forwarded_bytes), (3, 21));
+        assert_eq!((counters.by_reference, counters.caught_up), (2, 2));
+        assert_eq!((counters.accounted_number, counters.last_forwarded_at), (5, MonotonicNs(30)));
+    }
 }

@@ -33,7 +33,7 @@ impl Output {
         let waits = self.history.is_none()
             && self.writer.as_ref().is_some_and(|writer| {
                 self.former_readers.hold(now)
-                    || (self.former_readers.may_hold(now) && self.lack_former(writer))
+                    || (self.former_readers.may_hold(now) && self.lack_former(writer.matched_readers()))
             });
         // The readers that have matched must not lose samples to the others.
         self.is_held = waits && (self.counters.get().readers == 0 || !self.are_samples_nearly_lost());
@@ -46,7 +46,7 @@ impl Output {
     pub(super) fn is_to_be_paced(&mut self) -> bool {
         // The library may have sent them since the last turn, while another output kept the lane busy.
         self.is_paced = (self.is_library_full() && self.count_sent() && self.is_library_full())
-            || self.waits_for_readers();
+            || self.waits_for_any(self.writer.iter().flat_map(RawWriter::matched_readers));
         self.is_paced
     }
 
@@ -54,12 +54,10 @@ impl Output {
         self.catch_up.is_full(self.unsent.len() as u64, self.unsent.bytes())
     }
 
-    fn waits_for_readers(&self) -> bool {
+    pub(super) fn waits_for_any(&self, mut matched: impl Iterator<Item = ReaderRecord>) -> bool {
         self.catch_up.is_on(clock::monotonic)
             && self.history.is_none()
-            && self.writer.as_ref().is_some_and(|writer| {
-                writer.matched_readers().any(|reader| self.catch_up.waits_for(&reader))
-            })
+            && matched.any(|reader| self.catch_up.waits_for(&reader))
             // The others must not lose samples to a slow one.
             && !self.are_samples_nearly_lost()
     }
@@ -99,13 +97,13 @@ impl Output {
 
     /// Whether matched readers lack samples of the former process that are not counted yet. The library sends
     /// them when the last former reader has matched, and to a reader that is not ready then when it is.
-    fn lack_former(&self, writer: &RawWriter) -> bool {
+    pub(super) fn lack_former(&self, mut matched: impl Iterator<Item = ReaderRecord>) -> bool {
         let lacks = |reader: ReaderRecord| reader.reliable == 1 && reader.unacknowledged > 0;
-        self.unsent.len() > 0 && writer.matched_readers().any(lacks)
+        self.unsent.len() > 0 && matched.any(lacks)
     }
 
     /// Whether the queue is nearly full, and ingress keeps few samples before the next one either.
-    fn are_samples_nearly_lost(&self) -> bool {
+    pub(super) fn are_samples_nearly_lost(&self) -> bool {
         let last = self.boards.ingress(self.route).map_or(0, |ingress| ingress.published);
         let waiting = last.saturating_sub(self.tracker.last());
         let is_kept = || {

@@ -3,15 +3,20 @@
 use super::*;
 use crate::model::ProcessIdentity;
 
+/// The next process of the lane continues the participant of this one.
+fn keep_identity(host: &mut Host) {
+    let identity = ProcessIdentity { participant: host.participant.guid(), ..ProcessIdentity::default() };
+    host.role.boards.identity_writer(ProcessRole::Egress(CRITICAL)).set(identity.sealed());
+    host.role.former.participant = identity.participant;
+}
+
 /// The account of processes of a lane that keeps its identity. Each of the first three leaves a sample that
 /// is in the log and not counted; the last one has another writer.
 #[test]
 fn a_killed_process_leaves_its_samples_with_their_numbers() {
     let mut host = Host::start(150, CRITICAL, SCAN);
     host.announce_type();
-    let identity = ProcessIdentity { participant: host.participant.guid(), ..ProcessIdentity::default() };
-    host.role.boards.identity_writer(ProcessRole::Egress(CRITICAL)).set(identity.sealed());
-    host.role.former.participant = identity.participant;
+    keep_identity(&mut host);
     let mut first = host.open();
     for sequence in 11..=14 {
         host.publish_next(sequence);
@@ -91,4 +96,29 @@ fn a_killed_process_leaves_its_samples_with_their_numbers() {
     log.record(1, 18);
     host.role.former.participant = Guid([9; 16]);
     assert!(!host.open().collects_former());
+}
+
+#[test]
+fn a_process_reads_the_samples_of_the_former_one_before_ingress_delivers_them() {
+    let mut host = Host::start(169, CRITICAL, SCAN);
+    host.announce_type();
+    keep_identity(&mut host);
+    let mut keeper = host.keeper();
+    let mut first = host.open();
+    for sequence in 11..=14 {
+        host.publish_next(sequence);
+        keeper.keep_published();
+    }
+    for _ in 11..=13 {
+        host.send(&mut first);
+    }
+    host.role.boards.send_log(CRITICAL, 0).record(4, 14);
+    drop(first);
+
+    let mut second = host.open();
+    assert!(second.collects_former());
+    // Ingress has not connected to its queue.
+    second.collect_former(&mut host.participant, &mut host.arena);
+    assert!(!second.collects_former());
+    assert_eq!((dropped(&second, DropReason::NoReader), dropped(&second, DropReason::LaneDown)), (4, 0));
 }

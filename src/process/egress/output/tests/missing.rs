@@ -15,6 +15,7 @@ fn missing_samples_have_the_reason_why_the_lane_did_not_get_them() {
         (false, None, before, LaneDown),
         (false, None, after, LaneDown),
         (true, None, after, QueueOverflow),
+        (true, None, before, QueueOverflow),
         (false, Some(before), before, LaneDown),
         (false, Some(before), started, IngressDied),
         (false, Some(before), after, IngressDied),
