@@ -187,6 +187,11 @@ fn it_shows_what_was_run_and_what_was_not() {
 
     let markdown = fs::read_to_string(out.path().join("report.md")).unwrap();
     assert!(markdown.contains("- **H2: not tested.**") && markdown.contains("paper 15,043"), "{markdown}");
+    assert!(!markdown.contains("(README.md)"));
+    fs::write(out.path().join("README.md"), "# Notes\n").unwrap();
+    assert!(report(recorded().path(), out.path()).status.success());
+    let markdown = fs::read_to_string(out.path().join("report.md")).unwrap();
+    assert!(markdown.contains("[Notes](README.md): how to read the tables."), "{markdown}");
 }
 
 #[test]

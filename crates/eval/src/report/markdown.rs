@@ -7,9 +7,12 @@ use super::context::Context;
 use super::tables::{self, Field, Table};
 use super::verdict::{Finding, mechanism};
 
-/// Writes the report as Markdown.
-pub fn page(results: &Results, findings: &[Finding], context: &Context) -> String {
+/// Writes the report as Markdown, with a link to notes that are in its folder.
+pub fn page(results: &Results, findings: &[Finding], context: &Context, has_notes: bool) -> String {
     let mut page = format!("# Adaptive Bridge: evaluation\n\n{}\n", plain(&context.summary));
+    if has_notes {
+        page.push_str("\n[Notes](README.md): how to read the tables.\n");
+    }
     for warning in &context.warnings {
         let _ = write!(page, "\n**{}**\n", plain(warning));
     }

@@ -52,9 +52,10 @@ pub fn write(results: &Path, out: &Path) -> Result<Written, ReportError> {
     let findings = verdict::findings(&results);
     let context = Context::of(&results);
     fs::create_dir_all(out).map_err(ReportError::file(out))?;
+    let has_notes = out.join("README.md").exists();
     let contents = [
         ("report.html", html::page(&results, &findings, &context)),
-        ("report.md", markdown::page(&results, &findings, &context)),
+        ("report.md", markdown::page(&results, &findings, &context, has_notes)),
         ("figures.csv", csv::figures(&results)),
         ("runs.csv", csv::runs(&results)),
         ("verdicts.csv", csv::verdicts(&findings)),
