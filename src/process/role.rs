@@ -33,7 +33,7 @@ pub(super) struct Role {
     pub notifier: Notifier,
     /// What the former process wrote last; its participant is all zero once it is disposed of.
     pub former: ProcessHealth,
-    /// Until the first turn of a process that was a standby.
+    /// Until a process that was a standby is up.
     take_over: Option<TakeOver>,
     /// The last field, so that the lock is released only after everything else is dropped.
     lock: RoleLock,
@@ -139,10 +139,16 @@ impl Role {
             health.policy_epoch = policy_epoch;
             health.network_refusals = network_refusals;
         });
+        self.notifier.feed_watchdog(now);
+    }
+
+    /// The process is up. Not in [`report_turn`](Self::report_turn), which may wait until the threads of the DDS
+    /// library have turned, for 0.1 s.
+    pub fn is_up(&mut self) {
         if let Some(take_over) = self.take_over.take() {
             take_over.complete();
         }
-        self.notifier.feed_watchdog(now);
+        self.notifier.ready();
     }
 }
 

@@ -157,7 +157,7 @@ impl Active {
 
 /// What a standby has when it takes a role over.
 pub(super) struct TakeOver {
-    /// Held until the first turn, so that the next standby does not write the board before.
+    /// Held until the process is up, so that the next standby does not write the board before.
     _lock: RoleLock,
     board: BoardWriter<StandbyRecord>,
     /// The sockets of the former process.
@@ -354,7 +354,7 @@ impl Waiting {
 }
 
 impl TakeOver {
-    /// Records that the process has completed its first turn; then another one may wait for the role.
+    /// Records that the process is up; then another one may wait for the role.
     pub fn complete(mut self) {
         let now = clock::monotonic();
         let (cause, took_ns) = (self.cause, now.since(self.ended_at));

@@ -246,7 +246,7 @@ impl Egress {
         };
         egress.collect_former();
         egress.housekeeping(now);
-        egress.role.notifier.ready();
+        egress.role.is_up();
         Ok(egress)
     }
 

@@ -191,7 +191,7 @@ impl Ingress {
         };
         ingress.resume_places(housekeeping_at);
         ingress.housekeeping(housekeeping_at)?;
-        ingress.role.notifier.ready();
+        ingress.role.is_up();
         Ok(ingress)
     }
 
