@@ -142,8 +142,8 @@ impl Role {
         self.notifier.feed_watchdog(now);
     }
 
-    /// The process is up. Not in [`report_turn`](Self::report_turn), which may wait until the threads of the DDS
-    /// library have turned, for 0.1 s.
+    /// The process is up. Not in [`report_turn`](Self::report_turn), which may wait until the threads of the
+    /// DDS library have turned, for 0.1 s.
     pub fn is_up(&mut self) {
         if let Some(take_over) = self.take_over.take() {
             take_over.complete();
