@@ -17,6 +17,9 @@ const WATCHED: &str = "Cyclone DDS, RELIABLE";
 
 const LANE: &str = "egress-critical";
 
+/// How often the test repeats its eight take-overs; 1 without it.
+const ROUNDS_VARIABLE: &str = "ADAPTIVE_BRIDGE_TEST_TAKE_OVER_ROUNDS";
+
 /// What happens to an active process.
 #[derive(Clone, Copy, Debug)]
 enum Event {
@@ -86,7 +89,9 @@ fn end(name: &str, subscriber: RunningPeer, sent: &Sent) -> Received {
 fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
     let test = "a_standby_takes_over_and_no_subscriber_misses_a_sample";
     let signals = [Signal::SIGKILL, Signal::SIGSTOP, Signal::SIGTERM, Signal::SIGKILL].map(Event::Signal);
-    let events: Vec<_> = signals.into_iter().flat_map(|event| [(LANE, event), ("ingress", event)]).collect();
+    let rounds = std::env::var(ROUNDS_VARIABLE).map_or(1, |text| text.parse().unwrap());
+    let events = signals.into_iter().flat_map(|event| [(LANE, event), ("ingress", event)]);
+    let events: Vec<_> = std::iter::repeat_n(events, rounds).flatten().collect();
     take_over(test, &events, Peer::cyclone().keep_all());
 }
 

@@ -2990,8 +2990,8 @@ impl Writer {
     }
   }
 
-  // What a former process has sent and the reader has not received goes to it as a repair. Cyclone
-  // DDS requests it only 0.1 s after a HEARTBEAT.
+  // What a former process has sent and the reader has not received goes to it as a repair, without
+  // a wait for its request.
   fn repair_what_was_lost_with_former(&mut self, reader_guid: GUID) {
     let first_retained = self.send_buffer.first_change_sequence_number();
     let last = min(self.send_buffer.former_last(), self.last_sent());

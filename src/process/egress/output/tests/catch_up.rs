@@ -155,7 +155,7 @@ fn a_lane_does_not_wait_until_samples_are_lost() {
         assert_eq!(output.waits_for_any([behind].into_iter()), !are_nearly_lost, "{what}");
         for readers in [0, 1] {
             output.counters.update(|counters| counters.readers = readers);
-            // Without readers that have matched, the samples would reach nobody.
+            // No reader has matched, so a sample that the lane sends reaches none.
             assert_eq!(output.is_still_held(), readers == 0 || !are_nearly_lost, "{what} {readers}");
         }
     }
