@@ -711,15 +711,13 @@ impl DPEventLoop {
   // Runs the repair rounds that are due, as far as their share of this thread's time
   // goes.
   fn repair(&mut self) {
-    let mut now = Instant::now();
-    while let Some((entity_id, event)) = self.repair_turns.next(now) {
-      if let Some(writer) = self.writers.get_mut(&entity_id) {
+    let writers = &mut self.writers;
+    let wait = self.repair_turns.run(|(entity_id, event)| {
+      if let Some(writer) = writers.get_mut(&entity_id) {
         writer.handle_timed_event(event);
       }
-      let began = std::mem::replace(&mut now, Instant::now());
-      self.repair_turns.ran(now, now - began);
-    }
-    if let Some(wait) = self.repair_turns.wait(now) {
+    });
+    if let Some(wait) = wait {
       if !self.repairs_scheduled {
         self.repairs_scheduled = true;
         self
