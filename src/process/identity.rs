@@ -200,10 +200,12 @@ impl Identity {
             return;
         }
         self.is_outdated = false;
+        // After a stop of 1 s within it, the journal would wait for 20 s by the wall clock.
+        let began_ns = clock::thread_cpu_ns();
         if let Err(error) = self.journal.write(participant.guid(), &participant.discovery_journal()) {
             warn!(%error, "cannot write the journal of discovery; after a kill, others match anew");
         }
-        self.journal_at = now.plus_ns(clock::monotonic().since(now) * JOURNAL_SHARE);
+        self.journal_at = now.plus_ns(clock::thread_cpu_ns().saturating_sub(began_ns) * JOURNAL_SHARE);
     }
 
     /// How the process ends now that it was asked to.
