@@ -86,8 +86,6 @@ pub(super) struct Output {
     next: VecDeque<ShmSample>,
     /// How the lane receives what was published while it did not run.
     catch_up: CatchUp,
-    /// Samples taken since the queue was empty.
-    taken_in_a_row: u64,
     /// Whether samples wait until those before are sent, and acknowledged while the lane catches up.
     is_paced: bool,
     /// Whether samples wait in the queue until the former readers have matched.
@@ -192,7 +190,6 @@ impl Output {
             former: Some(Box::new(former_samples)),
             next: VecDeque::new(),
             catch_up,
-            taken_in_a_row: 0,
             is_paced: false,
             last_publisher: Guid::default(),
             unmatched: Vec::new(),
@@ -228,6 +225,7 @@ impl Output {
     /// because the new writer needs them for late joiners. After a restart, a critical lane takes none before
     /// its former readers have matched.
     pub fn take(&mut self) -> Option<ShmSample> {
+        self.catch_up.turn(clock::monotonic);
         if self.collects_former() || (self.is_held && self.is_still_held()) || self.is_to_be_paced() {
             return None;
         }
@@ -250,7 +248,7 @@ impl Output {
             let expected = self.tracker.last() + 1;
             if expected > 1 && expected < sequence {
                 self.begin_catch_up();
-                if self.catch_up.is_on(clock::monotonic) {
+                if self.catch_up.is_on() {
                     let behind = self.backlog(expected..sequence);
                     if !behind.is_empty() {
                         self.next.push_front(sample);
@@ -259,7 +257,7 @@ impl Output {
                     }
                 }
             }
-            self.follow_burst();
+            self.follow_burst(sample.payload().len());
             match self.tracker.record(sequence) {
                 SequenceOutcome::InOrder => {}
                 SequenceOutcome::AfterGap(missing) => self.count_missing(missing, sample.header()),

@@ -55,7 +55,7 @@ impl Output {
     }
 
     pub(super) fn waits_for_any(&self, mut matched: impl Iterator<Item = ReaderRecord>) -> bool {
-        self.catch_up.is_on(clock::monotonic)
+        self.catch_up.is_on()
             && self.history.is_none()
             && matched.any(|reader| self.catch_up.waits_for(&reader))
             // The others must not lose samples to a slow one.
@@ -68,20 +68,20 @@ impl Output {
         self.catch_up.begin(readers, clock::monotonic());
     }
 
-    /// The lane takes one more sample before its queue is empty.
-    pub(super) fn follow_burst(&mut self) {
-        self.taken_in_a_row += 1;
-        if self.taken_in_a_row == self.catch_up.burst_samples() {
+    /// The lane takes one more sample, of that size, before its queue is empty.
+    pub(super) fn follow_burst(&mut self, bytes: usize) {
+        if self.catch_up.takes(bytes as u64) {
             self.begin_catch_up();
         }
     }
 
-    /// The queue is empty.
+    /// The queue is empty. The lane has not caught up before the readers have: what comes next would push
+    /// samples out of the history of the writer that they still lack.
     pub(super) fn end_catch_up(&mut self) {
-        self.taken_in_a_row = 0;
+        let readers = || self.writer.iter().flat_map(RawWriter::matched_readers);
         // After a restart it is empty before ingress delivers to it.
-        if self.caught_up {
-            self.catch_up.end();
+        if self.caught_up && !self.waits_for_any(readers()) {
+            self.catch_up.end(readers());
         }
     }
 

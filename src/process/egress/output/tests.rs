@@ -576,6 +576,6 @@ fn a_critical_lane_leaves_out_what_is_too_old_to_catch_up_with() {
     output.history = Some(History::new(None));
     assert!(!output.is_too_old(&oldest), "late joiners may need it");
     output.history = None;
-    output.catch_up.end();
+    output.catch_up.end([]);
     assert!(!output.is_too_old(&oldest), "the lane is not behind");
 }
