@@ -249,6 +249,34 @@ fn a_killed_responder_counts_as_loss_and_its_restart_promotes_the_subscriber() {
     end(up, &bridge);
 }
 
+#[test]
+fn probes_have_their_own_topics_and_only_the_named_responder_counts() {
+    let Some(net) = net("probes_have_their_own_topics_and_only_the_named_responder_counts") else { return };
+    let host = net.host("robot");
+    let bridge = bridge(
+        "probes: {request_topic: /robot/ask, response_topic: /robot/answer, rate_hz: 10, window_size: 20, \
+         timeout_ms: 2000}\n\
+         classifier: {subscriber_id: laptop, demote_rtt_ms: 1000, promote_rtt_ms: 900}\n",
+    );
+    let up = up(&bridge, host);
+    // It takes the topics from the file. Its answers reach control, which is seen by their count.
+    let desk = bridge.start_on(host, "responder --id desk");
+    bridge.wait_status("answers of another responder", |status| {
+        refused(status, ProbeRefusal::NotTheSubscriber) > 20
+    });
+    let of_default_topics = responder(host, &[], &[]);
+    let status = bridge.status();
+    assert_eq!(subscriber(&status, "laptop")["state"], "UNKNOWN", "{status}");
+    drop(of_default_topics);
+    let topics = ["--request-topic", "/robot/ask", "--response-topic", "/robot/answer"];
+    let _laptop = responder(host, &topics, &[]);
+    let status = wait_state(&bridge, "CRITICAL", "normal");
+    let ids: Vec<_> = status["subscribers"].as_array().unwrap().iter().map(|it| &it["id"]).collect();
+    assert_eq!(ids, ["laptop"], "{status}");
+    drop(desk);
+    end(up, &bridge);
+}
+
 /// A wall clock that a test can step while a program runs, by Debian's libfaketime. The monotonic clock stays
 /// that of the machine.
 struct FakeClock {

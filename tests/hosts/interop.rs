@@ -503,6 +503,31 @@ fn the_ros_graph_shows_each_process_as_a_node_with_its_endpoints() {
 }
 
 #[test]
+fn the_endpoints_announce_the_deadline_and_the_lifespan_of_the_configuration() {
+    let test = "the_endpoints_announce_the_deadline_and_the_lifespan";
+    let yaml = "topics:\n  - {id: scan, input_topic: /scan, message_type: sensor_msgs/msg/LaserScan, \
+                qos_overrides: {input: {deadline_ms: 700}, critical: {deadline_ms: 800, lifespan_ms: 900}}}\n";
+    let Some(bed) = Bed::start(test, yaml) else { return };
+    let publisher = bed.publish(Peer::fast().rate_hz(10.0), INPUT);
+    let viewer = Peer::cyclone().graph(16).start_on(bed.host("slow"));
+    for (kind, topic, deadline_ms, lifespan_ms) in [
+        ("reader", INPUT, Some(700.0), None),
+        ("writer", CRITICAL, Some(800.0), Some(900.0)),
+        ("writer", NONCRITICAL, None, None),
+    ] {
+        let qos = support::wait_for(format!("the {kind} of {topic}"), || {
+            let endpoints = viewer.graph().endpoints;
+            let mut of_topic = endpoints.into_values().filter(|it| it.kind == kind && it.topic == topic);
+            of_topic.next().map(|endpoint| endpoint.qos)
+        });
+        let announced = ["deadline_ms", "lifespan_ms"].map(|policy| qos[policy].as_f64());
+        assert_eq!(announced, [deadline_ms, lifespan_ms], "{kind} of {topic}: {qos}");
+    }
+    let _: Sent = publisher.end();
+    bed.end();
+}
+
+#[test]
 fn each_lane_marks_its_datagrams_with_its_dscp() {
     let test = "each_lane_marks_its_datagrams_with_its_dscp";
     let Some(bed) = Bed::start(test, &format!("{SCAN}lanes: {{noncritical: {{dscp: 10}}}}\n")) else {

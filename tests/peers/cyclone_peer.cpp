@@ -305,6 +305,8 @@ std::string qos_json(const dds_qos_t* qos) {
   dds_qget_durability(qos, &durability);
   const bool has_history = dds_qget_history(qos, &history, &depth);
   dds_qget_deadline(qos, &deadline);
+  dds_duration_t lifespan = DDS_INFINITY;
+  dds_qget_lifespan(qos, &lifespan);
   static const char* const durabilities[] = {"VOLATILE", "TRANSIENT_LOCAL", "TRANSIENT", "PERSISTENT"};
   std::string json = "{\"reliability\":\"";
   json += reliability == DDS_RELIABILITY_RELIABLE ? "RELIABLE" : "BEST_EFFORT";
@@ -314,6 +316,7 @@ std::string qos_json(const dds_qos_t* qos) {
             "\",\"depth\":" + std::to_string(depth);
   }
   if (deadline != DDS_INFINITY) json += ",\"deadline_ms\":" + std::to_string(static_cast<double>(deadline) / 1e6);
+  if (lifespan != DDS_INFINITY) json += ",\"lifespan_ms\":" + std::to_string(static_cast<double>(lifespan) / 1e6);
   return json + ",\"user_data\":" + user_data_of(qos) + "}";
 }
 

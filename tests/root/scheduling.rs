@@ -67,6 +67,33 @@ fn the_threads_of_a_data_path_have_one_priority() {
     }
 }
 
+/// The locked memory of a process in KiB: `VmLck`, proc_pid_status(5).
+fn locked_kib(process: &Process) -> u64 {
+    let status = fs::read_to_string(format!("/proc/{}/status", process.pid())).unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmLck:")).unwrap();
+    line.split_whitespace().next().unwrap().parse().unwrap()
+}
+
+#[test]
+fn a_process_locks_its_memory_if_that_is_configured() {
+    let test = "a_process_locks_its_memory_if_that_is_configured";
+    if let Some(reason) = netns::requires_root() {
+        return skip(test, &reason);
+    }
+    let bridge = Bridge::new(
+        "instance: {instance}\nros: {domain_id: 115}\nshared_memory: {root_path: {folder}/root}\n\
+         topics: [{id: scan, input_topic: /scan, max_sample_bytes: 1024}]\n\
+         lanes: {critical: {scheduling: {lock_memory: true}}}\n",
+    );
+    let critical = bridge.start("egress --lane critical");
+    let noncritical = bridge.start("egress --lane noncritical");
+    critical.wait_for_log("egress is up");
+    noncritical.wait_for_log("egress is up");
+    // The program alone has more than 1 MiB.
+    assert!(locked_kib(&critical) > 1024, "{}", critical.log());
+    assert_eq!(locked_kib(&noncritical), 0);
+}
+
 /// Policy, as proc_pid_stat(5) counts, and CPUs of the early waker, if it runs.
 fn early_waker(ingress: &Process) -> Option<(u32, String)> {
     let tasks = fs::read_dir(format!("/proc/{}/task", ingress.pid())).unwrap();

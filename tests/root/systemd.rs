@@ -422,6 +422,14 @@ fn the_limits_of_memory_of_a_configuration_are_in_force_and_samples_flow() {
         println!("{unit}: {} of {} MiB", used >> 20, limit >> 20);
         assert!((1 << 20..limit).contains(&used), "{unit} uses {used} of {limit}");
         assert_eq!(bed.machine.property(unit, "NRestarts"), "0", "{unit}");
+        // The kernel slows down a process above it.
+        assert_eq!(bed.machine.property(unit, "MemoryHigh"), "infinity", "{unit}");
+    }
+    let slice_high = bed.machine.property("adaptive-bridge-noncritical.slice", "MemoryHigh");
+    assert!(slice_high.parse::<u64>().is_ok(), "{slice_high}");
+    // The kernel lets no process of a container have a lower score than the container.
+    for (unit, score) in UNITS.into_iter().zip(["-800", "-800", "300", "0"]) {
+        assert_eq!(bed.machine.property(unit, "OOMScoreAdjust"), score, "{unit}");
     }
     flow.end();
     bed.stop();

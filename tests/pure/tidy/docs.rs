@@ -317,6 +317,44 @@ fn the_documentation_of_the_configuration_keys_is_tested() {
     }
 }
 
+/// The cells of the README's table of the evaluation, as the report of it has them for one library: without
+/// the bridge, and with it.
+fn evaluation_cells(report: &str, library: &str) -> Vec<[String; 2]> {
+    let first = format!("{library}, strong loss as run");
+    let rows = rows(report);
+    let row = rows.iter().find(|row| row[0].starts_with(&first)).expect("a row of the library");
+    let [rate_hz, p95_ms, gap_ms, lost] = [1, 2, 3, 4].map(|column| row[column].split_once(" → ").unwrap());
+    let pair = |(without, with): (&str, &str), cell: &dyn Fn(f64, &str) -> String| {
+        [without, with].map(|text| cell(text.replace(',', "").parse().unwrap(), text))
+    };
+    let seconds = |ms: f64, _: &str| match ms / 1e3 {
+        s if s < 1.0 => format!("{s:.2} s"),
+        s => format!("{s:.1} s"),
+    };
+    let [without, with] = pair(rate_hz, &|hz, _| format!("{hz:.1} Hz"));
+    vec![
+        [format!("{without} of 30"), with],
+        pair(gap_ms, &seconds),
+        pair(p95_ms, &|ms, text| if ms < 100.0 { format!("{ms:.1} ms") } else { format!("{text} ms") }),
+        pair(lost, &|_, text| text.to_owned()),
+    ]
+}
+
+#[test]
+fn the_figures_of_the_readme_are_those_of_the_evaluation() {
+    let readme = std::fs::read_to_string(root().join("README.md")).unwrap();
+    let link = readme.split("docs/evaluation/").nth(1).and_then(|rest| rest.split('/').next()).unwrap();
+    let report = root().join("docs/evaluation").join(link).join("report.md");
+    let report = std::fs::read_to_string(report).unwrap();
+    let (fast, cyclone) = (evaluation_cells(&report, "Fast DDS"), evaluation_cells(&report, "Cyclone DDS"));
+    let expected: Vec<Vec<String>> =
+        fast.into_iter().zip(cyclone).map(|(fast, cyclone)| [fast, cyclone].concat()).collect();
+    let rows = rows(&readme);
+    let of_table = rows.iter().skip_while(|row| row[0] != "publisher").take(expected.len());
+    let found: Vec<&[&str]> = of_table.map(|row| &row[1..]).collect();
+    assert_eq!(found, expected);
+}
+
 #[test]
 fn dead_links_and_bad_records_are_found() {
     let exists = |path: &Path| path == Path::new("docs/there.md");
