@@ -188,9 +188,17 @@ impl Identity {
         self.board.set(board.sealed());
     }
 
-    /// Updates the board, and the journal if discovery has changed.
-    pub fn housekeeping(&mut self, participant: &Participant, discovery_changed: bool, now: MonotonicNs) {
-        let unproven = if now < self.proven_at { self.board.get().unproven } else { 0 };
+    /// Updates the board, and the journal if discovery has changed. A process whose threads have not `turned`
+    /// is not proven: what it has received may be why, and waits for the next one again.
+    pub fn housekeeping(
+        &mut self,
+        participant: &Participant,
+        turned: bool,
+        discovery_changed: bool,
+        now: MonotonicNs,
+    ) {
+        let is_proven = turned && now >= self.proven_at;
+        let unproven = if is_proven { 0 } else { self.board.get().unproven };
         self.record(participant, unproven);
         if let Some(successor) = &mut self.successor {
             successor.housekeeping();

@@ -362,8 +362,9 @@ impl Egress {
                 output.forget_unmatched(|reader| gone.iter().any(|change| takes_away(change, reader)));
             }
         }
+        let turned = self.participant.have_threads_turned(now);
         if let Some(identity) = &mut self.identity {
-            identity.housekeeping(&self.participant, discovery_changed, now);
+            identity.housekeeping(&self.participant, turned, discovery_changed, now);
         }
         if let Some(lane) = &mut self.noncritical
             && self
@@ -376,7 +377,7 @@ impl Egress {
         self.reload(now);
         // While a thread of the DDS library hangs, the lane forwards nothing. Without this report the
         // watchdog restarts the process.
-        if self.participant.have_threads_turned(now) {
+        if turned {
             let refusals = self.participant.network_refusals();
             self.role.report_turn(self.policy.mode as u8, self.policy.policy.epoch, refusals);
         }

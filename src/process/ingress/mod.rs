@@ -244,7 +244,8 @@ impl Ingress {
             self.hold_until = None;
             self.participant.receive_samples();
         }
-        self.identity.housekeeping(&self.participant, discovery_changed, now);
+        let turned = self.participant.have_threads_turned(now);
+        self.identity.housekeeping(&self.participant, turned, discovery_changed, now);
         // Not earlier: a publisher releases samples that every matched reader has acknowledged, and the
         // readers of this process have not requested them yet.
         if resumed && !std::mem::replace(&mut self.has_resumed, true) {
@@ -259,7 +260,7 @@ impl Ingress {
         if ring {
             self.participant.ring();
         }
-        if self.participant.have_threads_turned(now) {
+        if turned {
             self.role.report_turn(LaneMode::Normal as u8, 0, self.participant.network_refusals());
         }
         self.search_at = searching.then(|| now.plus_ms(SEARCHING_MS));

@@ -42,6 +42,8 @@ static_assertions::const_assert!(MESSAGE_BUFFER_ALLOCATION_CHUNK > MAX_MESSAGE_S
 // chunk of fragments with it, up to 1,024 of them for one topic: 256 MiB.
 const SMALL_MESSAGE_SIZE: usize = 16 * 1024;
 const SMALL_MESSAGES_CHUNK: usize = 64 * 1024;
+// Twice as many datagrams as a receive buffer of 4 MiB holds.
+const MAX_DISCARDED: usize = 16 * 1024;
 
 /// Listens to messages coming to specified host port combination.
 /// Only messages from added listen addressed are read when get_all_messages is
@@ -52,6 +54,9 @@ pub struct UDPListener {
   receive_buffer: BytesMut,
   // Where datagrams of up to SMALL_MESSAGE_SIZE are copied to.
   small_messages: BytesMut,
+  // Whether a datagram stays in the socket until it is handled, and whether one is there.
+  keeps_until_handled: bool,
+  is_kept: bool,
   multicast_group: Option<Ipv4Addr>,
   // Indexes of the interfaces on which the group is joined. By index, because an
   // interface keeps it when its address changes.
@@ -241,6 +246,8 @@ impl UDPListener {
       socket: mio_socket,
       receive_buffer: BytesMut::with_capacity(MESSAGE_BUFFER_ALLOCATION_CHUNK),
       small_messages: BytesMut::new(),
+      keeps_until_handled: false,
+      is_kept: false,
       multicast_group: None,
       joined: BTreeSet::new(),
       ifindex_map: build_ifindex_map_inner(interfaces),
@@ -278,6 +285,8 @@ impl UDPListener {
       socket,
       receive_buffer: BytesMut::with_capacity(MESSAGE_BUFFER_ALLOCATION_CHUNK),
       small_messages: BytesMut::new(),
+      keeps_until_handled: false,
+      is_kept: false,
       multicast_group: Some(multicast_group),
       joined: BTreeSet::new(),
       ifindex_map: HashMap::new(),
@@ -347,12 +356,49 @@ impl UDPListener {
       .collect()
   }
 
+  /// From now on `next_message` leaves its datagram in the socket until `handled` is
+  /// called: if the process is killed meanwhile, the one that takes over the socket
+  /// receives it again.
+  pub fn keep_until_handled(&mut self) {
+    self.keeps_until_handled = cfg!(unix);
+  }
+
+  /// What the last datagram holds is where a kill does not lose it.
+  pub fn handled(&mut self) {
+    #[cfg(unix)]
+    if std::mem::take(&mut self.is_kept) {
+      use std::os::unix::io::AsRawFd;
+
+      use nix::sys::socket::{recv, MsgFlags};
+      // Without a byte of it, and the rest of it is discarded.
+      if let Err(e) = recv(self.socket.as_raw_fd(), &mut [], MsgFlags::MSG_DONTWAIT) {
+        warn!("cannot discard a datagram: {e:?}");
+      }
+    }
+  }
+
+  /// Discards what waits in the socket.
+  pub fn discard_all(&mut self) {
+    #[cfg(unix)]
+    {
+      use std::os::unix::io::AsRawFd;
+
+      use nix::sys::socket::{recv, MsgFlags};
+      // New ones may come as fast as they are discarded.
+      let mut left = MAX_DISCARDED;
+      while left > 0 && recv(self.socket.as_raw_fd(), &mut [], MsgFlags::MSG_DONTWAIT).is_ok() {
+        left -= 1;
+      }
+    }
+  }
+
   /// The next datagram that waits in the socket, with its [`PacketOrigin`]
   /// (source address and receiving interface, when available).
   ///
   /// `None` when there is none. The reactor registers listeners edge-triggered:
   /// a datagram left unread does not produce another readiness event.
   pub fn next_message(&mut self) -> Option<(Bytes, PacketOrigin)> {
+    self.handled();
     // Loop invariant. Note that capacity() may be large, but .len() == 0.
     assert_eq!(self.receive_buffer.len(), 0);
 
@@ -441,6 +487,11 @@ impl UDPListener {
     };
 
     let fd = self.socket.as_raw_fd();
+    let flags = if self.keeps_until_handled {
+      MsgFlags::MSG_PEEK
+    } else {
+      MsgFlags::empty()
+    };
     let mut cmsg_space = nix::cmsg_space!(nix::libc::in_pktinfo);
 
     // Read the datagram and pull out the Copy metadata; the borrow of
@@ -450,7 +501,7 @@ impl UDPListener {
         &mut self.receive_buffer[..MAX_MESSAGE_SIZE],
       )];
       let msg =
-        match recvmsg::<SockaddrStorage>(fd, &mut iov, Some(&mut cmsg_space), MsgFlags::empty()) {
+        match recvmsg::<SockaddrStorage>(fd, &mut iov, Some(&mut cmsg_space), flags) {
           Ok(m) => m,
           Err(Errno::EAGAIN) => return Ok(None),
           Err(e) => return Err(io::Error::from_raw_os_error(e as i32)),
@@ -484,6 +535,7 @@ impl UDPListener {
       .map(InterfaceSelector::Ip)
       .or_else(|| self.ifindex_map.get(&ifindex).copied());
 
+    self.is_kept = self.keeps_until_handled;
     Ok(Some((nbytes, PacketOrigin { source, local_if })))
   }
 
@@ -600,6 +652,38 @@ mod tests {
     for (index, datagram) in small.iter().enumerate() {
       assert_eq!(datagram.as_ptr() as usize, begin + index * 1_004);
     }
+  }
+
+  // The next process has a duplicate of the socket.
+  #[cfg(unix)]
+  #[test]
+  fn a_datagram_that_a_killed_process_has_not_handled_is_received_again() {
+    let mut listener = UDPListener::new_unicast("127.0.0.1", 10014).unwrap();
+    let next = listener.duplicate().unwrap();
+    let receive = || {
+      let mut datagram = [0; 8];
+      next.recv(&mut datagram).ok().map(|_| datagram[0])
+    };
+    let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    assert_eq!(pass(&mut listener, &socket, 10014, &[1; 8])[0], 1);
+    assert_eq!(receive(), None);
+    listener.keep_until_handled();
+    assert_eq!(pass(&mut listener, &socket, 10014, &[2; 8])[0], 2);
+    assert_eq!(receive(), Some(2));
+    listener.is_kept = false;
+    assert_eq!(pass(&mut listener, &socket, 10014, &[3; 8])[0], 3);
+    listener.handled();
+    assert_eq!(receive(), None);
+    // The one before is discarded with the next one.
+    assert_eq!(pass(&mut listener, &socket, 10014, &[4; 8])[0], 4);
+    assert_eq!(pass(&mut listener, &socket, 10014, &[5; 8])[0], 5);
+    assert_eq!(receive(), Some(5));
+    listener.is_kept = false;
+    for number in 6..20 {
+      socket.send_to(&[number; 8], ("127.0.0.1", 10014)).unwrap();
+    }
+    listener.discard_all();
+    assert_eq!(receive(), None);
   }
 
   #[test]

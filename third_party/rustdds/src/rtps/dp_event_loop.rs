@@ -222,6 +222,14 @@ impl DPEventLoop {
     // so a datagram left in the socket cannot sit unreported.
     let mut udp_listeners = udp_listeners;
     for (token, listener) in &mut udp_listeners {
+      if hooks.on_received.is_some() && is_user_traffic(*token) {
+        listener.keep_until_handled();
+        // What waits in the sockets of a former participant is not for this one, and may be
+        // what ended that process.
+        if !hooks.holds_user_traffic {
+          listener.discard_all();
+        }
+      }
       if hooks.holds_user_traffic && is_user_traffic(*token) {
         continue;
       }
@@ -508,6 +516,9 @@ impl DPEventLoop {
       .message_receiver
       .handle_received_packet(&packet, origin);
     self.call_application();
+    if let Some(listener) = self.udp_listeners.get_mut(&token) {
+      listener.handled();
+    }
     true
   }
 
