@@ -80,6 +80,7 @@ fn a_process_locks_its_memory_if_that_is_configured() {
     if let Some(reason) = netns::requires_root() {
         return skip(test, &reason);
     }
+    let _exclusive = exclusive();
     let bridge = Bridge::new(
         "instance: {instance}\nros: {domain_id: 115}\nshared_memory: {root_path: {folder}/root}\n\
          topics: [{id: scan, input_topic: /scan, max_sample_bytes: 1024}]\n\

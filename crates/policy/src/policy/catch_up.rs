@@ -72,8 +72,7 @@ impl CatchUp {
         // The other half is for what a reader has not received of the samples that were sent.
         let most_unacknowledged = window_samples.div_ceil(2) as u64;
         // A lane that caught up when it ended may have waited for a reader that lacks half of them.
-        let is_slow =
-            |reader: &&ReaderRecord| reader.reliable == 1 && reader.unacknowledged >= window_samples as u64;
+        let is_slow = |reader: &&ReaderRecord| lacks(reader, window_samples as u64);
         let slow = former.into_iter().filter(is_slow).map(|reader| reader.reader).collect();
         Self { state: State::behind(now), most_unacknowledged, slow, ..Self::never() }
     }

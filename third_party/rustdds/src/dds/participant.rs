@@ -2338,6 +2338,59 @@ mod tests {
     assert_eq!(announced(&after, 0).urgent_port, identity.urgent_port);
   }
 
+  // A process that takes over the socket of one that was killed receives what the application of
+  // that one did not have yet; a participant that is another one does not.
+  #[test]
+  #[cfg(unix)]
+  fn a_datagram_stays_in_its_socket_until_the_application_was_called() {
+    use std::sync::{
+      atomic::{AtomicUsize, Ordering},
+      Arc, OnceLock,
+    };
+    let domain = test_domain_id(52);
+    // The hook may be called before the sockets of a new participant are known.
+    let open = |sockets, socket: Arc<OnceLock<std::net::UdpSocket>>| {
+      let seen = Arc::new(AtomicUsize::new(0));
+      let (in_hook, count) = (Arc::clone(&socket), Arc::clone(&seen));
+      let hook = move || {
+        let is_there = in_hook.get().is_some_and(|socket| socket.peek(&mut [0; 16]).is_ok());
+        count.fetch_add(is_there.into(), Ordering::SeqCst);
+        false
+      };
+      let participant = DomainParticipantBuilder::new(domain)
+        .with_sockets(sockets)
+        .on_received(hook)
+        .build()
+        .unwrap();
+      let sockets = participant.sockets().unwrap();
+      // RTPS v2.5 Section 9.6.2.4: the ports of user traffic are odd, the first one is that of multicast.
+      let port_of = |socket: &std::net::UdpSocket| socket.local_addr().unwrap().port();
+      let user_traffic = sockets.iter().filter(|socket| port_of(socket) % 2 == 1).max_by_key(|it| port_of(it));
+      let user_traffic = user_traffic.unwrap().try_clone().unwrap();
+      let port = port_of(&user_traffic);
+      let _ = socket.set(user_traffic);
+      (participant, sockets, seen, port)
+    };
+    let waits = |socket: &OnceLock<std::net::UdpSocket>| socket.get().unwrap().peek(&mut [0; 16]).is_ok();
+    let socket = Arc::new(OnceLock::new());
+    let (former, sockets, seen, port) = open(Vec::new(), Arc::clone(&socket));
+    let other = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    for number in 1..=20 {
+      other.send_to(b"not RTPS", ("127.0.0.1", port)).unwrap();
+      while seen.load(Ordering::SeqCst) < number || waits(&socket) {
+        std::thread::sleep(std::time::Duration::from_millis(1));
+      }
+    }
+    drop(former);
+    other.send_to(b"not RTPS", ("127.0.0.1", port)).unwrap();
+    assert!(waits(&socket));
+    let (_next, _sockets, seen, next_port) = open(sockets, Arc::clone(&socket));
+    assert_eq!(next_port, port);
+    std::thread::sleep(std::time::Duration::from_millis(100));
+    assert!(!waits(&socket));
+    assert_eq!(seen.load(Ordering::SeqCst), 0);
+  }
+
   // A writer with a given entity id tells each number that it gives, the first one too.
   #[test]
   fn a_writer_continues_one_of_a_former_process() {

@@ -42,7 +42,7 @@ static_assertions::const_assert!(MESSAGE_BUFFER_ALLOCATION_CHUNK > MAX_MESSAGE_S
 // chunk of fragments with it, up to 1,024 of them for one topic: 256 MiB.
 const SMALL_MESSAGE_SIZE: usize = 16 * 1024;
 const SMALL_MESSAGES_CHUNK: usize = 64 * 1024;
-// Twice as many datagrams as a receive buffer of 4 MiB holds.
+// More than a receive buffer of 4 MiB holds: 10,082 datagrams of one byte.
 const MAX_DISCARDED: usize = 16 * 1024;
 
 /// Listens to messages coming to specified host port combination.
@@ -356,40 +356,22 @@ impl UDPListener {
       .collect()
   }
 
-  /// From now on `next_message` leaves its datagram in the socket until `handled` is
-  /// called: if the process is killed meanwhile, the one that takes over the socket
-  /// receives it again.
+  /// From now on `next_message` leaves its datagram in the socket until the next call, by
+  /// which the one before must have been handled: if the process is killed meanwhile, the
+  /// one that takes over the socket receives it again.
   pub fn keep_until_handled(&mut self) {
     self.keeps_until_handled = cfg!(unix);
   }
 
-  /// What the last datagram holds is where a kill does not lose it.
-  pub fn handled(&mut self) {
-    #[cfg(unix)]
-    if std::mem::take(&mut self.is_kept) {
-      use std::os::unix::io::AsRawFd;
-
-      use nix::sys::socket::{recv, MsgFlags};
-      // Without a byte of it, and the rest of it is discarded.
-      if let Err(e) = recv(self.socket.as_raw_fd(), &mut [], MsgFlags::MSG_DONTWAIT) {
-        warn!("cannot discard a datagram: {e:?}");
-      }
-    }
+  /// Discards what waits in the socket.
+  pub fn discard_all(&self) {
+    // New ones may come as fast as they are discarded.
+    let _ = (0..MAX_DISCARDED).all(|_| self.discard_one().is_ok());
   }
 
-  /// Discards what waits in the socket.
-  pub fn discard_all(&mut self) {
-    #[cfg(unix)]
-    {
-      use std::os::unix::io::AsRawFd;
-
-      use nix::sys::socket::{recv, MsgFlags};
-      // New ones may come as fast as they are discarded.
-      let mut left = MAX_DISCARDED;
-      while left > 0 && recv(self.socket.as_raw_fd(), &mut [], MsgFlags::MSG_DONTWAIT).is_ok() {
-        left -= 1;
-      }
-    }
+  // Takes a datagram out of the socket, without a byte of it.
+  fn discard_one(&self) -> io::Result<usize> {
+    self.socket.recv(&mut [])
   }
 
   /// The next datagram that waits in the socket, with its [`PacketOrigin`]
@@ -398,7 +380,11 @@ impl UDPListener {
   /// `None` when there is none. The reactor registers listeners edge-triggered:
   /// a datagram left unread does not produce another readiness event.
   pub fn next_message(&mut self) -> Option<(Bytes, PacketOrigin)> {
-    self.handled();
+    if std::mem::take(&mut self.is_kept) {
+      if let Err(e) = self.discard_one() {
+        warn!("cannot discard a datagram that was handled: {e:?}");
+      }
+    }
     // Loop invariant. Note that capacity() may be large, but .len() == 0.
     assert_eq!(self.receive_buffer.len(), 0);
 
@@ -507,6 +493,8 @@ impl UDPListener {
           Err(e) => return Err(io::Error::from_raw_os_error(e as i32)),
         };
 
+      // Also if what came with it cannot be read: it would be received for ever.
+      self.is_kept = self.keeps_until_handled;
       let nbytes = msg.bytes;
       let source = msg.address.and_then(sockaddr_storage_to_socketaddr);
 
@@ -535,7 +523,6 @@ impl UDPListener {
       .map(InterfaceSelector::Ip)
       .or_else(|| self.ifindex_map.get(&ifindex).copied());
 
-    self.is_kept = self.keeps_until_handled;
     Ok(Some((nbytes, PacketOrigin { source, local_if })))
   }
 
@@ -672,9 +659,8 @@ mod tests {
     assert_eq!(receive(), Some(2));
     listener.is_kept = false;
     assert_eq!(pass(&mut listener, &socket, 10014, &[3; 8])[0], 3);
-    listener.handled();
+    assert!(listener.next_message().is_none());
     assert_eq!(receive(), None);
-    // The one before is discarded with the next one.
     assert_eq!(pass(&mut listener, &socket, 10014, &[4; 8])[0], 4);
     assert_eq!(pass(&mut listener, &socket, 10014, &[5; 8])[0], 5);
     assert_eq!(receive(), Some(5));

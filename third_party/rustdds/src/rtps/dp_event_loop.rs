@@ -516,9 +516,6 @@ impl DPEventLoop {
       .message_receiver
       .handle_received_packet(&packet, origin);
     self.call_application();
-    if let Some(listener) = self.udp_listeners.get_mut(&token) {
-      listener.handled();
-    }
     true
   }
 
