@@ -45,17 +45,32 @@ struct SmallSamples {
 }
 
 impl SampleMemory for SmallSamples {
-    fn lend(&self, _len: usize) -> Option<Box<dyn LentMemory>> {
-        None
+    fn lend(&self, len: usize) -> Option<Box<dyn LentMemory>> {
+        (len > self.max_bytes).then(|| Box::new(Discarded) as _)
     }
 
     fn limits(&self) -> AssemblyLimits {
         AssemblyLimits {
-            max_sample_bytes: self.max_bytes,
+            // With the encapsulation header.
+            max_sample_bytes: self.max_bytes + 4,
             max_total_bytes: 4 * self.max_bytes,
             max_kept_bytes: None,
         }
     }
+}
+
+/// Memory for a sample that is too large: its bytes are discarded as they arrive. It becomes complete like any
+/// other, or its RELIABLE writer would send it for ever, and nothing that it writes after it would be taken.
+struct Discarded;
+
+impl LentMemory for Discarded {
+    fn bytes(&mut self) -> &mut [u8] {
+        &mut []
+    }
+
+    fn write(&mut self, _from: usize, _data: &[u8]) {}
+
+    fn finish(self: Box<Self>) {}
 }
 
 /// The writer of a sample, its sequence number there, its source timestamp, and what it says of its key.
@@ -155,13 +170,14 @@ impl RawReader {
         self.inner.set_sample_memory(memory);
     }
 
-    /// Limits the memory for unfinished samples of the topic to 1 MiB a sample and 4 MiB in all.
+    /// Limits the memory for unfinished samples of the topic to 1 MiB a sample and 4 MiB in all. A larger
+    /// sample is taken without its bytes, as an empty [`Payload::Lent`].
     pub fn expect_small_samples(&self) {
         self.expect_samples_up_to(1 << 20);
     }
 
     /// Limits the memory for unfinished samples of the topic to `max_bytes` a sample and four times that in
-    /// all.
+    /// all. A larger sample is taken without its bytes, as an empty [`Payload::Lent`].
     pub fn expect_samples_up_to(&self, max_bytes: usize) {
         self.lend_memory(Arc::new(SmallSamples { max_bytes }));
     }
@@ -436,5 +452,20 @@ impl DeserializerAdapter<Received> for PayloadDecoder {
 
     fn transform_decoded(received: Received) -> Received {
         received
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_small_samples_4_mib_are_assembled_and_larger_ones_are_discarded() {
+        let small = SmallSamples { max_bytes: 1 << 20 };
+        assert_eq!(small.limits().max_total_bytes, 4 << 20);
+        assert!(small.lend(1 << 20).is_none());
+        let mut too_large = small.lend((1 << 20) + 1).unwrap();
+        too_large.write(1 << 20, &[7; 1]);
+        assert!(too_large.bytes().is_empty());
     }
 }

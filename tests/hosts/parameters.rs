@@ -258,6 +258,23 @@ fn requests_beyond_the_rate_of_a_participant_are_counted_and_dropped() {
     bed.end();
 }
 
+#[test]
+fn a_request_that_is_too_large_is_counted_and_the_next_one_is_answered() {
+    let test = "a_request_that_is_too_large_is_counted_and_the_next_one_is_answered";
+    let Some((bed, mut client)) = start(test) else { return };
+    // The reply to the first one would have some 200 kB. The second one has 70 kB, and comes in fragments.
+    let too_large = [vec!["instance".to_owned(); 3_000], vec!["n".repeat(70_000)]];
+    for (sent, names) in (1_u64..).zip(too_large) {
+        let call = json!({ "call": "get", "names": names, "times": 1, "waits": false });
+        client.event(&bed, "control", call);
+        bed.bridge.wait_status("a request that is too large", |status| {
+            status["parameters"]["requests"]["too_large"] == sent
+        });
+        assert_eq!(client.values(&bed, &["probes.rate_hz"]), json!([4.0]));
+    }
+    bed.end();
+}
+
 /// A client on Cyclone DDS of a service of a node.
 struct CycloneClient {
     peer: RunningPeer,

@@ -24,7 +24,7 @@ use super::super::parameter_store::ParameterStore;
 use super::super::scheduling;
 use crate::clock;
 use crate::config::{SetParameters, Settings};
-use crate::dds::{Inbox, Participant, RawReader, RawWriter, ReaderQos, SampleOrigin, TakePayload};
+use crate::dds::{Inbox, Participant, Payload, RawReader, RawWriter, ReaderQos, SampleOrigin, TakePayload};
 use crate::model::{
     Durability, Encapsulation, Guid, History, MonotonicNs, ParameterRequests, QosProfile, Reliability,
 };
@@ -325,8 +325,10 @@ impl Services {
             add(&self.counts.rate_limited);
             return true;
         }
+        // Of one in fragments the reader discards the bytes.
+        let is_discarded = matches!(payload, Payload::Lent(_));
         let payload = payload.bytes();
-        if payload.len() > MAX_REQUEST_BYTES {
+        if is_discarded || payload.len() > MAX_REQUEST_BYTES {
             add(&self.counts.too_large);
             return true;
         }
