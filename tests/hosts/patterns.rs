@@ -70,6 +70,16 @@ fn topics_that_match_are_carried_as_they_appear() {
     assert_eq!(before["/camera/front/image"]["id"], "any.1");
     assert_eq!(before["/camera/left/image"]["id"], "any.2");
 
+    // A name of 127 characters may wait, one of 128 may not.
+    let long = [127, 128].map(|length| {
+        let topic = format!("rt{:n<length$}", "/camera/");
+        Peer::cyclone().rate_hz(1.0).publisher().topic(&topic).start_on(bed.host("publisher"))
+    });
+    bed.bridge.wait_status("a name that is too long", |status| {
+        let pattern = &status["patterns"][0];
+        (&pattern["waiting"], &pattern["refused"]) == (&2.into(), &1.into())
+    });
+
     // A killed ingress keeps the places, and with them the sequence numbers and the account.
     signal(bed.pid("ingress"), Signal::SIGKILL);
     support::wait_until("a restart", || bed.pids("ingress").len() == 2);
@@ -88,7 +98,9 @@ fn topics_that_match_are_carried_as_they_appear() {
         });
     }
     excluded.end::<Sent>();
-    third.end::<Sent>();
+    for waiting in long.into_iter().chain([third]) {
+        waiting.end::<Sent>();
+    }
     raw.end::<Sent>();
     let status = bed.wait_accounted();
     let number = |value: &Value| value.as_u64().unwrap_or_else(|| panic!("{value}"));

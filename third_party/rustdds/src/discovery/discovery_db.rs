@@ -1249,6 +1249,15 @@ pub(crate) mod tests {
     let late = new_participant().participant_guid;
     assert!(!accepts(&mut db, late, 1, "theirs"));
     assert!(accepts(&mut db, late, 2, "ours"), "a reader of our topic is accepted");
+    // As many again, of five participants.
+    let mut accepted = 1;
+    for _ in 0..5 {
+      let other = new_participant().participant_guid;
+      let all = 0..MAX_ENDPOINTS_PER_PARTICIPANT;
+      accepted += all.filter(|n| accepts(&mut db, other, *n, "ours")).count();
+    }
+    assert_eq!(accepted, MAX_ENDPOINTS);
+    assert!(!accepts(&mut db, late, 3, "ours"));
     assert!(db.counters().counts().endpoints_refused > 5_000 - MAX_ENDPOINTS_PER_PARTICIPANT as u64);
   }
 

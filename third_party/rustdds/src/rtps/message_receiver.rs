@@ -1358,6 +1358,9 @@ mod tests {
     // One that needs more than the limit is not kept.
     assert_eq!(begin(0, 3, 60 << 20), (vec![0, 40, 30], 3));
     assert_eq!(begin(0, 4, 39 << 20), (vec![39, 40, 30], 3));
+    // Those of which no fragment came for long are discarded first, also those of topics with less.
+    std::thread::sleep(UNFINISHED_STALE + StdDuration::from_millis(50));
+    assert_eq!(begin(1, 2, 39 << 20), (vec![0, 39, 0], 6));
   }
 
   #[test]
