@@ -184,6 +184,11 @@ pub const MAX_UNSENT_CHANGES_PER_READER: usize = DEFAULT_WRITER_MAX_SAMPLES;
 // bounded.
 pub const MAX_TRACKED_CHANGES_PER_WRITER: usize = DEFAULT_WRITER_MAX_SAMPLES;
 
+// The same for a BestEffort Reader, which gets no sample that is missing later than the
+// network changes the order of datagrams. Of announcements, those that go to one
+// participant alone have numbers, too, so each participant leaves gaps all the time.
+pub const MAX_TRACKED_CHANGES_BEST_EFFORT: usize = 64;
+
 // Most payload bytes a TopicCache keeps of a topic of discovery: room for 4096
 // announcements of 4 KiB. Their Readers take them at once, so older ones are of no use,
 // and any participant can send 4096 of 64 KB to each of three topics.

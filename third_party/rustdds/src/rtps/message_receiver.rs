@@ -1257,7 +1257,7 @@ mod tests {
     mio_source,
     network::udp_sender::UDPSender,
     polling::{new_shared_timer, wake_channel, LoopWaker},
-    rtps::reader::ReaderIngredients,
+    rtps::{constant::MAX_TRACKED_CHANGES_BEST_EFFORT, reader::ReaderIngredients},
     serialization::from_bytes,
     structure::{dds_cache::DDSCache, guid::EntityKind, sequence_number::FragmentNumber},
   };
@@ -1300,6 +1300,31 @@ mod tests {
     let qos = QosPolicies::qos_none();
     reader.matched_writer_add(writer, EntityId::UNKNOWN, vec![], vec![], &qos);
     reader
+  }
+
+  // The announcements of a participant to all others have gaps, because those to one of
+  // them have numbers of the same writer.
+  #[test]
+  fn a_best_effort_reader_tracks_few_samples_of_a_writer_with_gaps() {
+    let writer =
+      EntityId::create_custom_entity_id([0, 0, 9], EntityKind::WRITER_NO_KEY_USER_DEFINED);
+    let prefix = GuidPrefix::new(&[2; 12]);
+    let source = GUID::new_with_prefix_and_id(prefix, writer);
+    let mut reader = best_effort_reader(1, "topic", source);
+    let mr_state = MessageReceiverState {
+      source_guid_prefix: prefix,
+      ..Default::default()
+    };
+    for number in 1..=1_000 {
+      let data = Data {
+        writer_id: writer,
+        writer_sn: SequenceNumber::new(2 * number),
+        ..Data::default()
+      };
+      let flags = BitFlags::<DATA_Flags>::from_flag(DATA_Flags::Data);
+      reader.handle_data_msg(data, flags, &mr_state);
+    }
+    assert_eq!(reader.tracked_changes_count(source), MAX_TRACKED_CHANGES_BEST_EFFORT);
   }
 
   // Whoever claims large samples on one topic gets no more than what is left, and the

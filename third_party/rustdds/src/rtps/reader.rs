@@ -45,7 +45,7 @@ use crate::{
   network::udp_sender::UDPSender,
   polling::{ReadySender, SharedTimer, WakeReceiver},
   rtps::{
-    constant::ACKNACK_DELAY,
+    constant::{ACKNACK_DELAY, MAX_TRACKED_CHANGES_BEST_EFFORT},
     fragment_assembler::{FragmentAssemblers, StatedOnce},
     identity::UsedNumbers,
     message_receiver::MessageReceiverState,
@@ -600,6 +600,9 @@ impl Reader {
       0
     } else {
       proxy.count_on(Arc::clone(&self.numbers));
+      if self.reliability == policy::Reliability::BestEffort {
+        proxy.track_at_most(MAX_TRACKED_CHANGES_BEST_EFFORT);
+      }
       self.matched_writers.insert(proxy.remote_writer_guid, proxy);
       1
     }
@@ -668,6 +671,11 @@ impl Reader {
       remote_group_entity_id,
     );
     self.update_writer_proxy(proxy, qos);
+  }
+
+  #[cfg(test)]
+  pub(crate) fn tracked_changes_count(&self, writer: GUID) -> usize {
+    self.matched_writers[&writer].tracked_changes_count()
   }
 
   fn matched_writer(&self, remote_writer_guid: GUID) -> Option<&RtpsWriterProxy> {
