@@ -33,6 +33,8 @@ policy)
 extern crate adaptive_bridge_policy as adaptive_bridge;
 #[path = "../../../tests/pure/control_policy/mod.rs"]
 mod control_policy;
+#[path = "../../../tests/pure/patterns.rs"]
+mod patterns;
 #[path = "../../../tests/pure/policy.rs"]
 mod policy;
 END

@@ -59,8 +59,8 @@ impl SampleMemory for SmallSamples {
     }
 }
 
-/// Memory for a sample that is too large: its bytes are discarded as they arrive. It becomes complete like any
-/// other, or its RELIABLE writer would send it for ever, and nothing that it writes after it would be taken.
+/// Memory for a sample that is too large: its bytes are discarded as they arrive. It becomes complete like
+/// any other, or its RELIABLE writer would send it for ever, and nothing that it writes later would be taken.
 struct Discarded;
 
 impl LentMemory for Discarded {

@@ -91,6 +91,23 @@ fn a_topic_without_samples_makes_room_after_its_trial_and_one_with_samples_does_
 }
 
 #[test]
+fn topics_that_had_a_place_wait_behind_new_ones_in_the_order_in_which_they_lost_it() {
+    let mut places = RoutePlaces::new(1);
+    for (name, participant) in [("first", 1), ("second", 1), ("other", 2)] {
+        places.writer_found(&topic(name), writer(participant, name.len() as u16));
+    }
+    let bound = |places: &mut RoutePlaces, trial| bind_all(places, at(trial * TRIAL_MS));
+    assert_eq!(bound(&mut places, 0), ["/first"]);
+    assert_eq!(bound(&mut places, 1), ["/other"], "its participant has no place");
+    assert_eq!(bound(&mut places, 2), ["/second"]);
+    places.writers_gone(|gone| gone == writer(1, "first".len() as u16));
+    places.writer_found(&topic("new"), writer(3, 0));
+    assert_eq!(bound(&mut places, 3), ["/new"]);
+    assert_eq!(bound(&mut places, 4), ["/other"], "it lost its place before the second one did");
+    assert_eq!(bound(&mut places, 5), ["/second"]);
+}
+
+#[test]
 fn a_topic_that_was_used_makes_room_when_its_writers_have_been_away() {
     let mut places = RoutePlaces::new(1);
     places.writer_found(&topic("used"), writer(1, 1));

@@ -98,12 +98,10 @@ impl CatchUp {
 
     /// The lane takes one more sample before its queue is empty. Returns whether it is behind: it has taken
     /// so many, or two or more with so many bytes, that there are more of them than one late sample.
-    pub const fn takes(&mut self, bytes: u64) -> bool {
+    pub fn takes(&mut self, bytes: u64) -> bool {
         self.burst.samples += 1;
         self.burst.bytes = self.burst.bytes.saturating_add(bytes);
-        if bytes > self.burst.largest_bytes {
-            self.burst.largest_bytes = bytes;
-        }
+        self.burst.largest_bytes = self.burst.largest_bytes.max(bytes);
         self.burst.samples >= self.most_unacknowledged.div_ceil(2)
             || (self.burst.samples > 1 && self.burst.bytes >= BURST_BYTES)
     }
