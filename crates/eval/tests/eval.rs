@@ -48,6 +48,19 @@ fn folder(test: &str) -> Option<TempDir> {
     }
 }
 
+fn docker(arguments: &str) -> std::io::Result<Output> {
+    Command::new("docker").args(arguments.split_whitespace()).output()
+}
+
+/// Like [`folder`], for a test that also needs the Docker Engine.
+fn folder_with_docker(test: &str) -> Option<TempDir> {
+    if !docker("version").is_ok_and(|output| output.status.success()) {
+        skip(test, "the Docker Engine does not answer");
+        return None;
+    }
+    folder(test)
+}
+
 /// What a harness with this process id has on the machine: hosts, folders, shared memory.
 fn traces(pid: i32) -> Vec<String> {
     let mut found = Vec::new();
@@ -302,12 +315,7 @@ fn a_run_over_a_trace_keeps_it_and_says_what_each_of_its_rows_lost() {
 #[test]
 fn quick_runs_on_containers_have_consistent_results_and_leave_no_container() {
     let test = "quick_runs_on_containers_have_consistent_results_and_leave_no_container";
-    let docker = |arguments: &str| Command::new("docker").args(arguments.split_whitespace()).output();
-    if !docker("version").is_ok_and(|output| output.status.success()) {
-        skip(test, "the Docker Engine does not answer");
-        return;
-    }
-    let Some(out) = folder(test) else { return };
+    let Some(out) = folder_with_docker(test) else { return };
     let _exclusive = exclusive();
     let mut command = command(out.path(), "run baseline_mild bridge_mild --quick --bed docker");
     let harness = command.stderr(Stdio::piped()).spawn().unwrap();
@@ -420,5 +428,59 @@ fn wrong_command_lines_are_said_before_anything_is_made() {
         let error = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(code), "{arguments}: {error}");
         assert!(error.contains(message), "{arguments}: {error}");
+    }
+}
+
+mod long {
+    use super::*;
+
+    /// The longest time in the measured window in which the critical subscriber received nothing.
+    fn longest_silence_ns(run: &Run) -> u64 {
+        let (begin, end) = (run.time("begin_ns"), run.time("end_ns"));
+        let mut times = run.numbers("critical.csv", "time_ns");
+        times.retain(|time| (begin..end).contains(time));
+        times.extend([begin, end]);
+        times.sort_unstable();
+        times.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap()
+    }
+
+    /// Runs of half a minute on containers, with all other times as in the experiments.
+    #[test]
+    fn on_containers_a_lossy_subscriber_silences_the_critical_one_only_without_the_bridge() {
+        let test = "on_containers_a_lossy_subscriber_silences_the_critical_one_only_without_the_bridge";
+        let Some(out) = folder_with_docker(test) else { return };
+        let _exclusive = exclusive();
+        let own = tempfile::tempdir().unwrap();
+        let names = ["baseline_strong", "bridge_strong"];
+        let mut arguments = "run --bed docker --library cyclone --reading as-run".to_owned();
+        for name in names {
+            let scenario = fs::read_to_string(root().join(format!("config/scenarios/{name}.yaml"))).unwrap();
+            assert!(scenario.contains("duration_s: 180"), "{scenario}");
+            let file = own.path().join(format!("{name}.yaml"));
+            // As in the paper: a reader that keeps all samples does not lose what waits while it is not run.
+            let scenario = scenario.replace("duration_s: 180", "duration_s: 30");
+            fs::write(&file, scenario + "workload: {critical_history: keep_all}\n").unwrap();
+            arguments += &format!(" {}", file.display());
+        }
+        run_well(out.path(), &arguments);
+        let made = fs::read_dir(out.path().join("runs")).unwrap();
+        let made: Vec<_> = made.map(|run| run.unwrap().file_name().into_string().unwrap()).collect();
+        // Docker's bridge is the one switch or the other, as the machine has it.
+        let runs = names.map(|name| {
+            let of_scenario: Vec<_> = made.iter().filter(|run| run.starts_with(name)).collect();
+            assert_eq!(of_scenario.len(), 1, "{made:?}");
+            Run::read(out.path(), of_scenario[0])
+        });
+        for run in &runs {
+            run.assert_consistent();
+            run.assert_documented();
+        }
+        let [baseline, bridge] = &runs;
+        let silences = runs.each_ref().map(longest_silence_ns);
+        assert!(silences[0] > 5 * silences[1], "{silences:?} ns");
+        let of_bridge = |name: &str, key: &str| bridge.endpoint(name)["summary"][key].clone();
+        assert_eq!(of_bridge("critical", "received"), of_bridge("publisher", "ok"));
+        let attempted = |run: &Run| run.endpoint("publisher")["summary"]["attempted"].as_u64().unwrap();
+        assert!(attempted(baseline) < attempted(bridge), "the publisher waits without the bridge");
     }
 }
