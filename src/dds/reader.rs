@@ -38,6 +38,9 @@ impl Payload {
     }
 }
 
+/// The largest sample of a topic whose samples have at most some KiB.
+const SMALL_SAMPLE_BYTES: usize = 1 << 20;
+
 /// The limits of topics whose samples have at most some KiB: graph entries, probes and their responses,
 /// requests. Any host on the network can send fragments that claim larger samples.
 struct SmallSamples {
@@ -173,7 +176,7 @@ impl RawReader {
     /// Limits the memory for unfinished samples of the topic to 1 MiB a sample and 4 MiB in all. A larger
     /// sample is taken without its bytes, as an empty [`Payload::Lent`].
     pub fn expect_small_samples(&self) {
-        self.expect_samples_up_to(1 << 20);
+        self.expect_samples_up_to(SMALL_SAMPLE_BYTES);
     }
 
     /// Limits the memory for unfinished samples of the topic to `max_bytes` a sample and four times that in
@@ -461,11 +464,11 @@ mod tests {
 
     #[test]
     fn of_small_samples_4_mib_are_assembled_and_larger_ones_are_discarded() {
-        let small = SmallSamples { max_bytes: 1 << 20 };
+        let small = SmallSamples { max_bytes: SMALL_SAMPLE_BYTES };
         assert_eq!(small.limits().max_total_bytes, 4 << 20);
-        assert!(small.lend(1 << 20).is_none());
-        let mut too_large = small.lend((1 << 20) + 1).unwrap();
-        too_large.write(1 << 20, &[7; 1]);
+        assert!(small.lend(SMALL_SAMPLE_BYTES).is_none());
+        let mut too_large = small.lend(SMALL_SAMPLE_BYTES + 1).unwrap();
+        too_large.write(SMALL_SAMPLE_BYTES, &[7]);
         assert!(too_large.bytes().is_empty());
     }
 }

@@ -313,7 +313,7 @@ impl Services {
 
     /// Answers the next request of one service, and returns whether there was one.
     fn serve(&mut self, server: usize) -> bool {
-        let (origin, mut payload, encapsulation) = match self.servers[server].inbox.take_from_any() {
+        let (origin, payload, encapsulation) = match self.servers[server].inbox.take_from_any() {
             TakePayload::Empty => return false,
             TakePayload::Malformed => {
                 add(&self.counts.malformed);
@@ -325,15 +325,13 @@ impl Services {
             add(&self.counts.rate_limited);
             return true;
         }
-        // Of one in fragments the reader discards the bytes.
-        let is_discarded = matches!(payload, Payload::Lent(_));
-        let payload = payload.bytes();
-        if is_discarded || payload.len() > MAX_REQUEST_BYTES {
+        // The reader has discarded the bytes of a request that is larger than `MAX_REQUEST_BYTES`.
+        let Payload::Bytes(payload) = payload else {
             add(&self.counts.too_large);
             return true;
-        }
+        };
         let service = self.servers[server].service;
-        match self.answer(service, &Request { origin, payload, encapsulation }) {
+        match self.answer(service, &Request { origin, payload: &payload, encapsulation }) {
             None => add(&self.counts.malformed),
             Some(reply) if reply.len() > service.max_reply_bytes() => add(&self.counts.too_large),
             Some(payload) => {
