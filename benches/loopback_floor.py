@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
-"""Shows what a program between two others on one host costs at least if all three talk UDP.
+"""Shows what a program between two others on one host costs if all three talk UDP, without any protocol.
 
     benches/loopback_floor.py
 
 A sender sends each sample as datagrams of 64 KiB, as Fast DDS does, to a receiver: directly, or through forwarders that
-know no protocol, parse nothing, and lose nothing. They are the lower bound of a router that does not use the shared
-memory of a library:
+know no protocol and parse nothing:
 
   one, each datagram       one process sends each datagram on when it has it
   one, whole sample        one process sends a sample on when it has all of it
@@ -13,12 +12,13 @@ memory of a library:
 
 All take turns in each round. The hop is the difference from direct in the same round, from the first send to the last
 datagram received; CPU is the time of the processes in between. Figures are medians of the rounds, in brackets the lowest
-and the highest. Needs only Python 3.10.
+and the highest. Needs only Python 3.10, whose interpreter takes a part of the CPU time.
 """
 
 import argparse
 import mmap
 import os
+import signal
 import socket
 import statistics
 import struct
@@ -34,9 +34,8 @@ FORWARDERS = ["one, each datagram", "one, whole sample", "two, each datagram"]
 def open_socket(port=None):
     """A socket that receives on a port, or one that sends to it."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
-        # SO_RCVBUFFORCE and SO_SNDBUFFORCE, which need CAP_NET_ADMIN.
-        force = {socket.SO_RCVBUF: 33, socket.SO_SNDBUF: 32}[option]
+    # With SO_RCVBUFFORCE and SO_SNDBUFFORCE, which need CAP_NET_ADMIN.
+    for option, force in ((socket.SO_RCVBUF, 33), (socket.SO_SNDBUF, 32)):
         try:
             opened.setsockopt(socket.SOL_SOCKET, force, BUFFER)
         except PermissionError:
@@ -52,12 +51,14 @@ def port_of(opened):
     return opened.getsockname()[1]
 
 
-def start(cpu, work):
+def start(cpu, work, samples):
     """Runs work in a process on that CPU; returns what reads its numbers when it has ended."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
         os.sched_setaffinity(0, {cpu})
+        # After a lost datagram it would wait for ever.
+        signal.alarm(samples // RATE_HZ + 10)
         began = time.process_time()
         numbers = work() or []
         os.write(writer, struct.pack(f"{len(numbers) + 1}d", time.process_time() - began, *numbers))
@@ -69,7 +70,7 @@ def start(cpu, work):
             packed = results.read()
         os.waitpid(child, 0)
         if not packed:
-            sys.exit("a process of the measurement has failed")
+            sys.exit("a process has failed, or a datagram was lost: run as root, or raise net.core.rmem_max to 16 MiB")
         return struct.unpack(f"{len(packed) // 8}d", packed)
 
     return result
@@ -133,16 +134,16 @@ def measure(kind, lengths, samples, cpus):
     args = lengths, samples
     between = []
     if kind == "one, each datagram":
-        between = [start(cpus[1], lambda: forward_each(source, port_of(last), *args))]
+        between = [start(cpus[1], lambda: forward_each(source, port_of(last), *args), samples)]
     elif kind == "one, whole sample":
-        between = [start(cpus[1], lambda: forward_whole(source, port_of(last), *args))]
+        between = [start(cpus[1], lambda: forward_whole(source, port_of(last), *args), samples)]
     elif kind == "two, each datagram":
         # Two samples never overlap at this rate.
         slot, filled = mmap.mmap(-1, len(lengths) * DATAGRAM), os.eventfd(0)
-        between = [start(cpus[1], lambda: receive_into(source, slot, filled, *args)),
-                   start(cpus[0], lambda: send_from(slot, filled, port_of(last), *args))]
-    receiver = start(cpus[(len(between) + 1) % 2], lambda: receive(last, *args))
-    sender = start(cpus[0], lambda: send(port_of(source if between else last), *args))
+        between = [start(cpus[1], lambda: receive_into(source, slot, filled, *args), samples),
+                   start(cpus[0], lambda: send_from(slot, filled, port_of(last), *args), samples)]
+    receiver = start(cpus[(len(between) + 1) % 2], lambda: receive(last, *args), samples)
+    sender = start(cpus[0], lambda: send(port_of(source if between else last), *args), samples)
     sender()
     _, latency = receiver()
     cpu = sum(result()[0] for result in between)
@@ -163,6 +164,8 @@ def main():
         "--cpus", type=int, nargs=2, metavar=("A", "B"), default=[0, 1],
         help="each process runs on the other CPU than the one before it (default: 0 1)")
     options = arguments.parse_args()
+    if not set(options.cpus) <= os.sched_getaffinity(0):
+        arguments.error(f"--cpus: choose two of {sorted(os.sched_getaffinity(0))}")
     print(f"{options.rounds} rounds of {options.samples} samples at {RATE_HZ} Hz, CPUs {options.cpus}")
     print("| bytes | between | latency, us | hop, us | CPU, us a sample |\n|---|---|---|---|---|")
     for size in options.bytes:
