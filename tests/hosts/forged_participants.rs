@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use adaptive_bridge::config;
 use adaptive_bridge::process::MemoryNeeds;
-use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN};
+use support::bridge::refused;
 use support::peer::{Peer, Received, Sent};
 use support::process::memory_kib;
 use support::rtps::{LEASE_S, Message, Prefix};
@@ -47,12 +47,6 @@ fn announce(socket: &UdpSocket, processes: &[SocketAddrV4], stop: &AtomicBool) {
             std::thread::sleep(due.saturating_sub(begin.elapsed()));
         }
     }
-}
-
-fn refused(status: &Value, process: &str, cause: &str) -> u64 {
-    let processes = status["processes"].as_array().unwrap();
-    let process = processes.iter().find(|found| found["name"] == process).unwrap();
-    process["network_refusals"][cause].as_u64().unwrap()
 }
 
 /// Tests of a minute or more: `make test-long`.

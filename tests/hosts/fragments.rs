@@ -5,6 +5,7 @@ use std::net::{SocketAddrV4, UdpSocket};
 
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN};
+use support::bridge::refused;
 use support::peer::{Peer, Received, Sent};
 use support::process::memory_kib;
 use support::rtps::{Fragment, Message, Prefix, SEDP_PUBLICATIONS, SEDP_SUBSCRIPTIONS};
@@ -78,6 +79,13 @@ mod long {
         let route: &Value = &status["routes"][0];
         assert_eq!(route["drops"]["too_large"].as_u64(), Some(too_large.ok), "{route}");
         assert_eq!(route["lost_upstream"].as_u64(), Some(0), "{route}");
+        // Of the 200 kB samples, the discovery readers keep 20 at most.
+        let discarded = ROLES.map(|role| refused(&status, role, "unfinished_sample"));
+        println!("unfinished samples discarded: {discarded:?}");
+        for (role, discarded) in ROLES.into_iter().zip(discarded) {
+            // A full socket buffer discards the others.
+            assert!(discarded > u64::from(FORGED) / 4, "{role} discarded {discarded}");
+        }
         assert!(route["received_bytes"].as_u64().unwrap() > too_large.ok * (20 << 20), "{route}");
         bed.end();
     }

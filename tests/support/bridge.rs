@@ -28,6 +28,13 @@ pub fn assert_demo_lost_nothing(demo: &Value) {
     assert!(bridge["remote"]["received"].as_u64().unwrap() > 0, "{demo:#}");
 }
 
+/// How often a process has refused something of the network for this cause, one of `NetworkRefusal`.
+pub fn refused(status: &Value, process: &str, cause: &str) -> u64 {
+    let processes = status["processes"].as_array().unwrap();
+    let process = processes.iter().find(|found| found["name"] == process).unwrap();
+    process["network_refusals"][cause].as_u64().unwrap()
+}
+
 /// One bridge: an instance name and a folder with its configuration file.
 ///
 /// Declare it before its processes: dropping a process kills it and leaves its shared memory behind, which

@@ -48,9 +48,10 @@ pub struct NetworkCounts {
   pub participants_evicted: u64,
   /// Announcements of endpoints and topics that were dropped: no room for another.
   pub endpoints_refused: u64,
-  /// Unfinished samples that were discarded because those of all readers together
-  /// needed more memory than
-  /// [`with_max_unfinished_bytes`](crate::DomainParticipantBuilder::with_max_unfinished_bytes) allows.
+  /// Unfinished samples that were discarded for a limit: 128 of a Writer, the memory of a
+  /// reader, or that of all readers together
+  /// ([`with_max_unfinished_bytes`](crate::DomainParticipantBuilder::with_max_unfinished_bytes)).
+  /// Not those of which the rest never came.
   pub unfinished_discarded: u64,
 }
 
@@ -82,7 +83,11 @@ pub(crate) struct Counter(AtomicU64);
 
 impl Counter {
   pub fn increment(&self) {
-    self.0.fetch_add(1, Ordering::Relaxed);
+    self.add(1);
+  }
+
+  pub fn add(&self, count: usize) {
+    self.0.fetch_add(count as u64, Ordering::Relaxed);
   }
 
   fn get(&self) -> u64 {

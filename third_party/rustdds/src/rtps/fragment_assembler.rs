@@ -397,10 +397,6 @@ impl FragmentAssembler {
     } else {
       debug!("new_dataFrag: FRAGMENT NOT COMPLETED YET");
       assembly_buffer.report_arrival(writer, sn);
-      // Only a new buffer can exceed a limit.
-      if is_first && self.assembly_buffers.len() > MAX_ASSEMBLY_BUFFERS {
-        self.evict();
-      }
       None
     }
   }
@@ -439,6 +435,11 @@ impl FragmentAssembler {
     for discarded in std::mem::replace(&mut self.assembly_buffers, kept).into_values() {
       self.own_bytes -= discarded.own_bytes();
     }
+  }
+
+  // Whether there are more unfinished samples than a Writer may have.
+  fn has_too_many(&self) -> bool {
+    self.assembly_buffers.len() > MAX_ASSEMBLY_BUFFERS
   }
 
   /// Whether there is no unfinished sample.
@@ -492,6 +493,9 @@ impl FragmentAssembler {
 pub(crate) struct FragmentAssemblers {
   by_writer: BTreeMap<GUID, FragmentAssembler>,
   own_bytes: usize,
+  // Unfinished samples that were discarded for a limit of a Writer or of the Reader, until
+  // `take_evicted`.
+  evicted: usize,
 }
 
 impl FragmentAssemblers {
@@ -516,6 +520,11 @@ impl FragmentAssemblers {
     let lender = if is_first { lender() } else { Lender::default() };
     let before = assembler.own_bytes;
     let completed = assembler.new_datafrag(writer, datafrag, flags, stated, &lender);
+    // Only a new sample can exceed a limit.
+    if is_first && assembler.has_too_many() {
+      assembler.evict();
+      self.evicted += 1;
+    }
     self.own_bytes = self.own_bytes - before + assembler.own_bytes;
     if assembler.is_empty() {
       self.by_writer.remove(&writer);
@@ -531,6 +540,7 @@ impl FragmentAssemblers {
       if self.evict() == 0 {
         break;
       }
+      self.evicted += 1;
     }
   }
 
@@ -550,6 +560,12 @@ impl FragmentAssemblers {
       self.by_writer.remove(&writer);
     }
     freed
+  }
+
+  /// How many unfinished samples [`new_datafrag`](Self::new_datafrag) has discarded for a
+  /// limit since the last call.
+  pub fn take_evicted(&mut self) -> usize {
+    std::mem::take(&mut self.evicted)
   }
 
   pub fn own_bytes(&self) -> usize {

@@ -759,8 +759,11 @@ impl MessageReceiver {
           target_reader,
           &mr_state,
         );
+        let displaced = target_reader.take_evicted();
         // Only the first fragment of a sample takes memory.
-        if target_reader.unfinished_bytes() > before {
+        let has_grown = target_reader.unfinished_bytes() > before;
+        self.counters.unfinished_discarded.add(displaced);
+        if has_grown {
           self.discard_unfinished_over_limit();
         }
       }
@@ -783,9 +786,8 @@ impl MessageReceiver {
     if bytes > max_bytes {
       for reader in self.available_readers.values_mut() {
         let before = reader.unfinished_bytes();
-        for _ in 0..reader.discard_stale(UNFINISHED_STALE) {
-          self.counters.unfinished_discarded.increment();
-        }
+        let discarded = reader.discard_stale(UNFINISHED_STALE);
+        self.counters.unfinished_discarded.add(discarded);
         bytes -= before - reader.unfinished_bytes();
       }
     }
@@ -1263,7 +1265,49 @@ mod tests {
   };
   use super::*;
 
-  fn best_effort_reader(id: u8, topic: &str, writer: GUID) -> Reader {
+  const WRITER: EntityId = EntityId {
+    entity_key: [0, 0, 9],
+    entity_kind: EntityKind::WRITER_NO_KEY_USER_DEFINED,
+  };
+
+  fn user_reader(id: u8) -> EntityId {
+    EntityId::create_custom_entity_id([0, 0, id], EntityKind::READER_NO_KEY_USER_DEFINED)
+  }
+
+  // For what one participant sends.
+  fn receiver_from_one_source(counters: &Arc<NetworkCounters>) -> MessageReceiver {
+    let waker = LoopWaker::new();
+    let (acknack_sender, _acknacks) = wake_channel(1, &waker);
+    let (spdp_liveness_sender, _spdp_liveness) = wake_channel(1, &waker);
+    let mut receiver = MessageReceiver::new(
+      GuidPrefix::new(&[1; 12]),
+      acknack_sender,
+      spdp_liveness_sender,
+      None,
+      Rc::new(RefCell::new(InterfaceObservations::new())),
+      Arc::clone(counters),
+    );
+    receiver.dest_guid_prefix = receiver.own_guid_prefix;
+    receiver.source_guid_prefix = GuidPrefix::new(&[2; 12]);
+    receiver
+  }
+
+  fn first_fragment(reader: EntityId, number: i64, data_size: u32) -> WriterSubmessage {
+    let first = DataFrag {
+      reader_id: reader,
+      writer_id: WRITER,
+      writer_sn: SequenceNumber::new(number),
+      fragment_starting_num: FragmentNumber::new(1),
+      fragments_in_submessage: 1,
+      fragment_size: 60_000,
+      data_size,
+      serialized_payload: Bytes::from(vec![7; 60_000]),
+      ..DataFrag::default()
+    };
+    WriterSubmessage::DataFrag(first, BitFlags::empty())
+  }
+
+  fn best_effort_reader(entity: EntityId, topic: &str, writer: GUID) -> Reader {
     let (notification_sender, _) = crate::mio_source::notification_channel(100);
     let (_, poll_event_sender) = mio_source::make_poll_channel().unwrap();
     let (status_sender, _) = sync_status_channel::<DataReaderStatus>(4).unwrap();
@@ -1275,8 +1319,6 @@ mod tests {
       TypeDesc::new("test".to_string()),
       &qos_policy,
     );
-    let entity =
-      EntityId::create_custom_entity_id([0, 0, id], EntityKind::READER_NO_KEY_USER_DEFINED);
     let ingredients = ReaderIngredients {
       guid: GUID::new_with_prefix_and_id(GuidPrefix::new(&[1; 12]), entity),
       notification_sender,
@@ -1310,7 +1352,7 @@ mod tests {
       EntityId::create_custom_entity_id([0, 0, 9], EntityKind::WRITER_NO_KEY_USER_DEFINED);
     let prefix = GuidPrefix::new(&[2; 12]);
     let source = GUID::new_with_prefix_and_id(prefix, writer);
-    let mut reader = best_effort_reader(1, "topic", source);
+    let mut reader = best_effort_reader(user_reader(1), "topic", source);
     let mr_state = MessageReceiverState {
       source_guid_prefix: prefix,
       ..Default::default()
@@ -1331,45 +1373,20 @@ mod tests {
   // samples of another topic are put together beside them.
   #[test]
   fn unfinished_samples_of_all_readers_together_are_bounded() {
-    let waker = LoopWaker::new();
-    let (acknack_sender, _acknacks) = wake_channel(1, &waker);
-    let (spdp_liveness_sender, _spdp_liveness) = wake_channel(1, &waker);
     let counters: Arc<NetworkCounters> = Arc::default();
-    let mut receiver = MessageReceiver::new(
-      GuidPrefix::new(&[1; 12]),
-      acknack_sender,
-      spdp_liveness_sender,
-      None,
-      Rc::new(RefCell::new(InterfaceObservations::new())),
-      Arc::clone(&counters),
-    );
+    let mut receiver = receiver_from_one_source(&counters);
     receiver.max_unfinished_bytes = Some(110 << 20);
-    receiver.dest_guid_prefix = receiver.own_guid_prefix;
-    receiver.source_guid_prefix = GuidPrefix::new(&[2; 12]);
-    let writer =
-      EntityId::create_custom_entity_id([0, 0, 9], EntityKind::WRITER_NO_KEY_USER_DEFINED);
-    let source = GUID::new_with_prefix_and_id(receiver.source_guid_prefix, writer);
+    let source = GUID::new_with_prefix_and_id(receiver.source_guid_prefix, WRITER);
     let readers: Vec<EntityId> = (1..=3)
       .map(|id| {
-        let reader = best_effort_reader(id, &format!("topic{id}"), source);
+        let reader = best_effort_reader(user_reader(id), &format!("topic{id}"), source);
         let entity_id = reader.entity_id();
         receiver.add_reader(reader);
         entity_id
       })
       .collect();
     let mut begin = |reader: usize, number: i64, data_size: u32| {
-      let first = DataFrag {
-        reader_id: readers[reader],
-        writer_id: writer,
-        writer_sn: SequenceNumber::new(number),
-        fragment_starting_num: FragmentNumber::new(1),
-        fragments_in_submessage: 1,
-        fragment_size: 60_000,
-        data_size,
-        serialized_payload: Bytes::from(vec![7; 60_000]),
-        ..DataFrag::default()
-      };
-      let fragment = WriterSubmessage::DataFrag(first, BitFlags::empty());
+      let fragment = first_fragment(readers[reader], number, data_size);
       receiver.handle_writer_submessage(readers[reader], fragment);
       let bytes = |id| receiver.available_readers[id].unfinished_bytes();
       let bytes: Vec<usize> = readers.iter().map(|id| bytes(id) >> 20).collect();
@@ -1386,6 +1403,27 @@ mod tests {
     // Those of which no fragment came for long are discarded first, also those of topics with less.
     std::thread::sleep(UNFINISHED_STALE + StdDuration::from_millis(50));
     assert_eq!(begin(1, 2, 39 << 20), (vec![0, 39, 0], 6));
+  }
+
+  // The largest samples of a Writer, many small ones of a Writer, and announcements, which
+  // anybody can send.
+  #[test]
+  fn unfinished_samples_that_others_displace_are_counted() {
+    let built_in = EntityId::SEDP_BUILTIN_PUBLICATIONS_READER;
+    for (reader, data_size, sent, kept) in [
+      (user_reader(1), 60 << 20, 10, 2),
+      (user_reader(1), 100_000, 200, 128),
+      (built_in, 200 << 10, 50, 20),
+    ] {
+      let counters: Arc<NetworkCounters> = Arc::default();
+      let mut receiver = receiver_from_one_source(&counters);
+      let source = GUID::new_with_prefix_and_id(receiver.source_guid_prefix, WRITER);
+      receiver.add_reader(best_effort_reader(reader, "topic", source));
+      for number in 1..=sent {
+        receiver.handle_writer_submessage(reader, first_fragment(reader, number, data_size));
+      }
+      assert_eq!(counters.counts().unfinished_discarded, sent as u64 - kept, "of {data_size} bytes");
+    }
   }
 
   #[test]

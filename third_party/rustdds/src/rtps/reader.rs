@@ -857,6 +857,12 @@ impl Reader {
     self.fragment_assemblers.evict()
   }
 
+  /// How many unfinished samples DATAFRAGs have displaced since the last call, because one
+  /// Writer had too many, or all Writers together claimed too much memory.
+  pub fn take_evicted(&mut self) -> usize {
+    self.fragment_assemblers.take_evicted()
+  }
+
   /// Discards the unfinished samples of which no fragment has come for so long, and returns
   /// how many.
   pub fn discard_stale(&mut self, max_age: StdDuration) -> usize {
