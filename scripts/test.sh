@@ -39,8 +39,7 @@ step make --no-print-directory peers
 # others with network namespaces three at a time.
 export RUST_TEST_THREADS="${RUST_TEST_THREADS:-4}"
 if [ "$what" = test-long ]; then
-    # `make test-image` builds the image, for six minutes.
-    step cargo test --locked --workspace --tests -- ::long:: --skip docker::long::
+    step cargo test --locked --workspace --tests -- ::long::
     step scripts/fuzz.sh "${FUZZ_SECONDS:-10}"
     exit
 fi

@@ -313,7 +313,7 @@ fn samples_flow_after_any_container_is_killed_and_down_leaves_nothing() {
 mod long {
     use super::*;
 
-    /// `make test-image` runs it.
+    /// `make test-image` runs it alone.
     #[test]
     fn the_image_that_the_dockerfile_builds_checks_demonstrates_and_forwards() {
         let test = "the_image_that_the_dockerfile_builds_checks_demonstrates_and_forwards";
