@@ -811,7 +811,6 @@ impl Discovery {
       return;
     }
     self.initialize_participant();
-    self.watch_interfaces();
     self.take_over_known();
     self.announce_first();
 
@@ -836,6 +835,9 @@ impl Discovery {
     // If this triggers, then discovery_started channel has been
     // closed, which likely means the receiver (app thread) has paniced also.
     // They will wait for up to 10 sec for us to send this handshake.
+
+    // Enumerates the interfaces again, for 1 to 2 ms, for which the application need not wait.
+    self.watch_interfaces();
 
     let mut events = Events::with_capacity(32);
     loop {
