@@ -18,7 +18,7 @@ use super::channel::{ICEORYX_HEADER_BYTES, RouteChannel, SLOT_HEADER_BYTES};
 use super::error::ShmError;
 use super::header::WireHeader;
 use super::node::{NodeShared, ShmNode, StartLock};
-use super::pool_view::PoolView;
+use super::pool_view::PoolFile;
 use super::publisher::SamplePublisher;
 use super::service::Service;
 use super::subscriber::ShmSample;
@@ -132,7 +132,7 @@ impl BacklogKeeper {
 /// Copies the samples of a route with these sequence numbers that ingress keeps, in order.
 ///
 /// # Errors
-/// The pool cannot be mapped, for example because ingress has ended.
+/// The pool cannot be opened, for example because ingress has ended.
 pub fn read_backlog(boards: &Boards, route: usize, wanted: Range<u64>) -> Result<Vec<ShmSample>, ShmError> {
     let kept = |wanted: &Range<u64>, backlog: &Backlog| {
         let first = backlog.first_sequence;
@@ -143,11 +143,11 @@ pub fn read_backlog(boards: &Boards, route: usize, wanted: Range<u64>) -> Result
     if range.is_empty() {
         return Ok(Vec::new());
     }
-    let view = PoolView::open(backlog.pool.as_str())?;
+    let pool = PoolFile::open(backlog.pool.as_str())?;
     let mut samples = Vec::new();
     for slot in 0..backlog.slots {
         let begin = backlog.first_offset + slot * backlog.stride_bytes;
-        let Some(header) = view.copy_header(begin + ICEORYX_HEADER_BYTES as u64) else { break };
+        let Some(header) = pool.header(begin + ICEORYX_HEADER_BYTES as u64) else { break };
         let fits = header.payload_bytes <= backlog.stride_bytes - SLOT_HEADER_BYTES as u64;
         if fits && range.contains(&header.sample.sequence) {
             samples.push((header, begin + SLOT_HEADER_BYTES as u64));
@@ -155,7 +155,7 @@ pub fn read_backlog(boards: &Boards, route: usize, wanted: Range<u64>) -> Result
     }
     samples.sort_unstable_by_key(|(header, _)| header.sample.sequence);
     let copy = |(header, payload): (WireHeader, u64)| {
-        Some(ShmSample::copied(header.sample, view.copy_payload(payload, header.payload_bytes)?))
+        Some(ShmSample::copied(header.sample, pool.payload(payload, header.payload_bytes)?))
     };
     let mut samples: Vec<ShmSample> = samples.into_iter().filter_map(copy).collect();
     // The slots of samples that are not kept any more may have been written meanwhile.
