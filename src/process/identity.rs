@@ -42,6 +42,10 @@ const fn max_unproven(process: ProcessRole) -> u64 {
 /// thousand participants that come and go change it with each housekeeping.
 const JOURNAL_SHARE: u64 = 20;
 
+/// How long a process that continues another one leaves the journal that it has just read as it is: to write
+/// it takes 1.3 ms, for which a take-over waits.
+const JOURNAL_AFTER_MS: u64 = 100;
+
 /// What a process may use between two updates of the board, each 100 ms.
 const RESERVED_COUNTS: i32 = 1 << 16;
 const RESERVED_NUMBERS: i64 = 1 << 12;
@@ -128,6 +132,9 @@ impl Identity {
                 identity.successor = (standby == Standby::Warm).then(|| role.successor(sockets));
             }
             Err(error) => not_kept(&error),
+        }
+        if continued {
+            identity.journal_at = clock::monotonic().plus_ms(JOURNAL_AFTER_MS);
         }
         let unproven = if continued { identity.board.get().unproven } else { 0 };
         identity.record(&participant, unproven);
