@@ -23,8 +23,8 @@ use crate::model::{
     Reliability, RouteInfo, SampleHeader, TopicName, TrafficClass,
 };
 use crate::shm::{
-    BacklogKeeper, BoardWriter, HistogramWriter, LaneWaker, LoanError, NoMemory, PoolBudget, RouteChannel,
-    SamplePublisher, Stage, backlog_bytes,
+    BacklogKeeper, BoardWriter, Boards, HistogramWriter, LaneWaker, LoanError, NoMemory, PoolBudget,
+    RouteChannel, SamplePublisher, ShmError, ShmNode, Stage, backlog_bytes,
 };
 
 /// Interval at which a route without a publisher logs that it waits.
@@ -64,6 +64,9 @@ pub(super) struct Input {
     remind_at: MonotonicNs,
 }
 
+/// The shared memory of an input: what it publishes to, and what it keeps for a lane that restarts.
+pub(super) type OpenedPool = (SamplePublisher, Option<BacklogKeeper>);
+
 pub(super) enum Step {
     Published,
     /// A sample was taken and not published: repeated, malformed or dropped.
@@ -81,24 +84,39 @@ struct ActiveReader {
 }
 
 impl Input {
+    /// Opens the pool of the route with this number.
+    ///
+    /// # Errors
+    /// Shared memory cannot be opened.
+    pub fn open_pool(
+        node: &ShmNode,
+        boards: &Boards,
+        settings: &Settings,
+        index: usize,
+        budget: &Arc<PoolBudget>,
+    ) -> Result<OpenedPool, ShmError> {
+        let channel = RouteChannel::of(settings, index);
+        let publisher = SamplePublisher::create_within(node, &channel, budget, index)?;
+        let board = boards.backlog_writer(index);
+        let backlog = BacklogKeeper::open(node, &channel, &publisher, backlog_bytes(settings), board)?;
+        Ok((publisher, backlog))
+    }
+
+    /// The input of the route with this number, which publishes to `pool`.
     pub fn open(
         role: &Role,
         settings: &Settings,
         index: usize,
         flag: &Arc<ArrivalFlag>,
-        budget: &Arc<PoolBudget>,
-    ) -> Result<Self, RoleError> {
+        (publisher, backlog): OpenedPool,
+    ) -> Self {
         let route = settings.routes[index].clone();
-        let channel = RouteChannel::of(settings, index);
-        let publisher = SamplePublisher::create_within(&role.node, &channel, budget, index)?;
-        let board = role.boards.backlog_writer(index);
-        let backlog = BacklogKeeper::open(&role.node, &channel, &publisher, backlog_bytes(settings), board)?;
         let mut counters = role.boards.ingress_writer(index);
         counters.update(|counters| counters.writers = 0);
         let publishers = Publishers::open(&role.boards, index, counters.get(), clock::monotonic());
         let info = role.boards.route_info_writer(index);
         let topic = route.input_topic.resolve(info.get());
-        Ok(Self {
+        Self {
             id: route.id.to_string(),
             dds_topic: topic.map_or_else(String::new, |topic| topic.to_dds()),
             configured_type: route.message_type.as_ref().map(|name| name.to_dds()),
@@ -124,7 +142,7 @@ impl Input {
             publishers,
             remind_at: MonotonicNs(0),
             route,
-        })
+        }
     }
 
     /// Whether there is a reader for at least one publisher.

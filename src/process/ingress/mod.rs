@@ -34,9 +34,9 @@ use crate::clock;
 use crate::config::{InputTopic, Route, Settings};
 use crate::dds::{ArrivalFlag, Discovery, Participant};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
-use crate::shm::{PoolBudget, ProcessRole};
+use crate::shm::{Boards, PoolBudget, ProcessRole, ShmError, ShmNode};
 use early_waker::EarlyWaker;
-use input::Input;
+use input::{Input, OpenedPool};
 use patterns::Patterns;
 use receiving::{Receiving, ServedLane};
 
@@ -65,7 +65,7 @@ const RESUMED_MS: u64 = 200;
 /// sample that does not fit the socket's buffer is lost: with the default `net.core.rmem_max`, the 97th scan.
 const HOLD_MS: u64 = 100;
 /// How often it checks that.
-const HOLD_POLL_MS: u64 = 2;
+const HOLD_POLL_MS: u64 = 1;
 
 /// Runs ingress until `stop` is requested. No reloadable setting concerns ingress.
 ///
@@ -139,23 +139,8 @@ impl Ingress {
     fn open(settings: &Settings, place: Place) -> Result<Self, RoleError> {
         let mut role = Role::open(place, ProcessRole::Ingress);
         memory_limit::check(settings, ProcessRole::Ingress);
-        let mut inputs = Vec::with_capacity(settings.routes.len());
-        let budget = PoolBudget::of(settings);
-        for route in 0..settings.routes.len() {
-            let flag = ArrivalFlag::passive();
-            inputs.push((Input::open(&role, settings, route, &flag, &budget)?, flag));
-        }
-        let mut lanes = Vec::with_capacity(settings.lanes.len());
-        for class in [TrafficClass::Critical, TrafficClass::Noncritical] {
-            for (index, lane) in settings.lanes.iter().enumerate().filter(|(_, lane)| lane.class() == class) {
-                let serves = (0..settings.routes.len())
-                    .map(|route| lane.outputs.iter().any(|output| output.route == route))
-                    .collect();
-                lanes.push(ServedLane { waker: role.boards.waker(index), class, serves });
-            }
-        }
         let urgent: Vec<_> = urgent_routes(settings).collect();
-        let receiving = Arc::new(Receiving::new(inputs, lanes, !urgent.is_empty()));
+        let shared = Arc::default();
         let options = participant_options(settings, &settings.input, NAME);
         let urgent_topics = || {
             urgent.iter().filter_map(|route| match &settings.routes[*route].input_topic {
@@ -165,11 +150,35 @@ impl Ingress {
         };
         let unfinished = pool::UNFINISHED_IN_ALL_BYTES;
         let open = |kept| {
-            let (on_arriving, on_received) = receiving.hooks();
+            let (on_arriving, on_received) = Receiving::hooks(&shared);
             Participant::open_receiving(&options, kept, unfinished, urgent_topics(), on_arriving, on_received)
         };
-        let (participant, identity, continued) =
-            Identity::join(&mut role, ProcessRole::Ingress, NAME, &options, settings.ingress_standby, open)?;
+        let (node, boards) = (role.node.clone(), role.boards.clone());
+        let standby = settings.ingress_standby;
+        // The pools beside the participant: either takes some 8 ms, for which a take-over waits.
+        let (pools, joined) = std::thread::scope(|scope| {
+            let pools = scope.spawn(|| open_pools(&node, &boards, settings));
+            let joined = Identity::join(&mut role, ProcessRole::Ingress, NAME, &options, standby, open);
+            (pools.join(), joined)
+        });
+        let pools = match pools {
+            Ok(Ok(pools)) => pools,
+            Ok(Err(error)) => {
+                // As if the process were killed: what is dropped would say goodbye, and the next process
+                // could not continue the former one.
+                std::mem::forget(joined);
+                return Err(error.into());
+            }
+            Err(panic) => std::panic::resume_unwind(panic),
+        };
+        let (participant, identity, continued) = joined?;
+        let mut inputs = Vec::with_capacity(settings.routes.len());
+        for (route, pool) in pools.into_iter().enumerate() {
+            let flag = ArrivalFlag::passive();
+            inputs.push((Input::open(&role, settings, route, &flag, pool), flag));
+        }
+        let receiving = Arc::new(Receiving::new(inputs, served_lanes(settings, &role), !urgent.is_empty()));
+        let _ = shared.set(Arc::clone(&receiving));
         let resume_until = clock::monotonic().plus_ms(RESUME_MS);
         let hold_until = continued.then(|| clock::monotonic().plus_ms(HOLD_MS));
         let patterns = Patterns::open(settings, &role.boards);
@@ -299,6 +308,27 @@ impl Ingress {
             self.participant.ring();
         }
     }
+}
+
+/// Opens the pool of each route.
+fn open_pools(node: &ShmNode, boards: &Boards, settings: &Settings) -> Result<Vec<OpenedPool>, ShmError> {
+    let budget = PoolBudget::of(settings);
+    let routes = 0..settings.routes.len();
+    routes.map(|route| Input::open_pool(node, boards, settings, route, &budget)).collect()
+}
+
+/// The lanes, critical ones first.
+fn served_lanes(settings: &Settings, role: &Role) -> Vec<ServedLane> {
+    let mut lanes = Vec::with_capacity(settings.lanes.len());
+    for class in [TrafficClass::Critical, TrafficClass::Noncritical] {
+        for (index, lane) in settings.lanes.iter().enumerate().filter(|(_, lane)| lane.class() == class) {
+            let serves = (0..settings.routes.len())
+                .map(|route| lane.outputs.iter().any(|output| output.route == route))
+                .collect();
+            lanes.push(ServedLane { waker: role.boards.waker(index), class, serves });
+        }
+    }
+    lanes
 }
 
 /// The routes that ingress receives before all others: those on a critical lane with a priority above the

@@ -6,7 +6,7 @@
 //! lock: it skips a locked route, and is woken when the lock is free.
 
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError};
 
 use super::input::{Input, Step};
 use super::publishers::HighWaterMarks;
@@ -85,14 +85,17 @@ impl Receiving {
 
     /// The two callbacks of the DDS library's receiving thread: one for a datagram that seems to hold a
     /// sample, with its writer, its sequence number and the bytes that are missing; one after each datagram.
+    /// They do nothing until `receiving` is set: no reader exists before.
     pub fn hooks(
-        self: &Arc<Self>,
+        receiving: &Arc<OnceLock<Arc<Self>>>,
     ) -> (impl FnMut([u8; 16], i64, usize) + use<>, impl FnMut() -> bool + use<>) {
-        let (arriving, received) = (Arc::clone(self), Arc::clone(self));
+        let (arriving, received) = (Arc::clone(receiving), Arc::clone(receiving));
         let on_arriving = move |writer, sequence, left_bytes| {
-            arriving.wake_early(Guid(writer), sequence, left_bytes, this_cpu());
+            if let Some(receiving) = arriving.get() {
+                receiving.wake_early(Guid(writer), sequence, left_bytes, this_cpu());
+            }
         };
-        (on_arriving, move || received.turn(true))
+        (on_arriving, move || received.get().is_some_and(|receiving| receiving.turn(true)))
     }
 
     /// Like [`for_each_input`](Self::for_each_input), for one route.

@@ -35,7 +35,8 @@ impl Host {
 
     fn open(&self) -> Input {
         let budget = PoolBudget::of(&self.settings);
-        Input::open(&self.role, &self.settings, 0, &ArrivalFlag::passive(), &budget).unwrap()
+        let pool = Input::open_pool(&self.role.node, &self.role.boards, &self.settings, 0, &budget).unwrap();
+        Input::open(&self.role, &self.settings, 0, &ArrivalFlag::passive(), pool)
     }
 
     fn housekeeping(&mut self, input: &mut Input) {
