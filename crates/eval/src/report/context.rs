@@ -6,11 +6,11 @@ use std::time::{Duration, UNIX_EPOCH};
 use super::cells::{Results, reading_name};
 use super::format;
 use super::paper;
-use super::record::{Manifest, Run};
+use super::record::{Manifest, Role, Run};
 
 /// Texts about the runs of a report.
 pub struct Context {
-    /// One line about the number of runs and their settings.
+    /// A paragraph about the number of runs, their settings, and how to read the tables.
     pub summary: String,
     /// Warnings that apply to the whole report.
     pub warnings: Vec<String>,
@@ -68,14 +68,24 @@ fn summary(results: &Results) -> String {
         (least, most) if least == most => format!("{most} times"),
         (least, most) => format!("{least} to {most} times"),
     };
-    format!(
+    let mut summary = format!(
         "{} runs: {cells} experiments, each {}, with {} on {}. Below a figure are the paper's value and the \
          deviation from it.",
         results.runs.len(),
         repetitions,
         joined(libraries),
         beds.into_iter().collect::<Vec<_>>().join(" and ")
-    )
+    );
+    if results.cells().any(|cell| (2..6).contains(&cell.runs.len())) {
+        summary += " The interval of two to five runs is their range.";
+    }
+    // The paper's subscribers have KEEP_ALL.
+    let critical = results.runs.iter().flat_map(|run| &run.manifest.endpoints);
+    if critical.clone().any(|one| one.role == Role::Critical && one.history.starts_with("KEEP_LAST")) {
+        summary += " Critical subscribers with KEEP_LAST: newer samples replace those that come late, which \
+                    count as lost.";
+    }
+    summary
 }
 
 fn facts(results: &Results) -> Vec<(&'static str, Vec<String>)> {
@@ -227,4 +237,21 @@ fn not_run(results: &Results) -> Vec<String> {
         }
     }
     missing
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::made_up::{MadeUp, results};
+
+    #[test]
+    fn the_summary_explains_intervals_and_losses_only_if_there_are_any() {
+        let run = MadeUp::default();
+        let one = summary(&results(std::slice::from_ref(&run)));
+        assert!(!one.contains("range") && !one.contains("KEEP_LAST"), "{one}");
+        let mut three = results(&[run.clone(), run.clone(), run]);
+        three.runs[1].manifest.endpoints[1].history = "KEEP_LAST 10".to_owned();
+        let three = summary(&three);
+        assert!(three.contains("their range") && three.contains("KEEP_LAST"), "{three}");
+    }
 }

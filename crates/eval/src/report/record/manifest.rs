@@ -76,6 +76,8 @@ pub struct Endpoint {
     pub lane: Option<String>,
     pub rate_hz: f64,
     #[serde(default)]
+    pub history: String,
+    #[serde(default)]
     pub command_line: Vec<String>,
     #[serde(default)]
     pub environment: BTreeMap<String, String>,

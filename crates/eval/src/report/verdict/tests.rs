@@ -49,6 +49,16 @@ fn h1_is_partly_confirmed_or_contradicted() {
 }
 
 #[test]
+fn the_longest_silence_is_that_of_one_run_and_no_median() {
+    let mut runs = baselines("as-run", 20.0, 12_000.0);
+    for lost in [0, 59] {
+        runs.push(MadeUp { scenario: "baseline_strong", reading: "as-run", lost, ..runs[1].clone() });
+    }
+    let found = finding(&runs, 1);
+    assert!(found.because.contains("without a critical sample 2."), "{}", found.because);
+}
+
+#[test]
 fn h1_compares_with_the_clean_baseline_of_the_other_switch_if_there_is_no_other() {
     let mut runs = baselines("as-run", 20.0, 12_000.0);
     for run in &mut runs[1..] {
