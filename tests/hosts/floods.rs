@@ -1,5 +1,5 @@
-//! Floods of valid discovery and graph entries from one peer: what a process takes at a time
-//! and keeps.
+//! Floods of valid discovery and graph entries from one peer: what a process takes of them at a time, what
+//! it keeps, and what it logs.
 
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::time::{Duration, Instant};
@@ -7,14 +7,14 @@ use std::time::{Duration, Instant};
 use adaptive_bridge::dds::encode_graph;
 use adaptive_bridge::model::Guid;
 use serde_json::Value;
-use support::bed::{INPUT, SCAN, SCAN_TYPE};
+use support::bed::{CRITICAL, INPUT, SCAN, SCAN_TYPE};
 use support::bridge::{Bridge, program};
 use support::forger::Forger;
 use support::netns::{Net, requires_root};
 use support::process::{Process, memory_kib};
 use support::rtps::{EntityId, PARTICIPANT, Prefix};
-use support::skip;
 use support::visitors::Endpoint;
+use support::{skip, wait_until};
 
 /// The entity id of the writer of graph entries.
 const GRAPH_WRITER: EntityId = [0, 0, 0x20, 0x03];
@@ -26,6 +26,9 @@ const CDR_LE: [u8; 4] = [0, 1, 0, 0];
 const MAX_GROWTH_KIB: i64 = 32 << 10;
 /// The most readers and writers in a graph entry.
 const MAX_ENDPOINTS: usize = 8_192;
+/// The lines of one place in the source that a process logs at once, and then per second.
+const BURST_LINES: u64 = 200;
+const LINES_PER_S: u64 = 5;
 
 /// Creates a host with the bridge and one with the hostile peer; `None`, with `test` recorded as skipped, if
 /// the machine cannot.
@@ -147,4 +150,51 @@ fn control_goes_on_and_grows_little_during_a_flood_of_graph_entries() {
         assert!(growth_kib < MAX_GROWTH_KIB, "control grew by {growth_kib} KiB");
     }
     assert!(control.terminate().success(), "{}", control.log());
+}
+
+/// The lines of a log that contain `text`.
+fn lines(log: &str, text: &str) -> u64 {
+    log.lines().filter(|line| line.contains(text)).count() as u64
+}
+
+/// The lines that a log reports as left out.
+fn left_out(log: &str) -> u64 {
+    let reports = log.lines().filter(|line| line.contains("log lines left out"));
+    let count = |line: &str| line.rsplit_once(" lines=")?.1.split_whitespace().next()?.parse::<u64>().ok();
+    reports.map(|line| count(line).unwrap_or_else(|| panic!("{line}"))).sum()
+}
+
+#[test]
+fn log_lines_that_a_peer_provokes_are_limited_and_those_left_out_are_counted() {
+    let test = "log_lines_that_a_peer_provokes_are_limited_and_those_left_out_are_counted";
+    let Some(net) = net(test) else { return };
+    let bridge = Bridge::new(&format!("instance: {{instance}}\n{SCAN}"));
+    let mut lane = bridge.start_on(net.host("robot"), "egress --lane critical");
+    lane.wait_for_log("egress is up");
+    let since = Instant::now();
+    let forger = Forger::new(net.host("laptop"), 1, lane.pid().as_raw());
+    let matched = Endpoint::reader(CRITICAL, SCAN_TYPE);
+    let unmatched = matched.clone().transient_local();
+    for (kind, reader, text) in [
+        (1, matched, "readers changed"),
+        (2, unmatched, "a reader requests a stricter QoS than this lane offers"),
+    ] {
+        let left_out_before = left_out(&lane.log());
+        let provoked = || {
+            let log = lane.log();
+            (lines(&log, text), left_out(&log) - left_out_before)
+        };
+        let mut entities = (0..u16::MAX).map(|number| [kind, (number >> 8) as u8, number as u8, 0x04]);
+        wait_until(format!("1000 lines, logged or left out: {text}"), || {
+            forger.announce(&reader, &entities.by_ref().take(50).collect::<Vec<_>>());
+            std::thread::sleep(Duration::from_millis(50));
+            let (logged, left_out) = provoked();
+            logged + left_out >= 1_000
+        });
+        let (logged, left_out) = provoked();
+        println!("{logged} logged, {left_out} left out: {text}");
+        let bound = BURST_LINES + LINES_PER_S * since.elapsed().as_secs() + 1;
+        assert!(logged <= bound, "{logged} of at most {bound} lines: {text}");
+    }
+    assert!(lane.terminate().success(), "{}", lane.log());
 }
