@@ -8,6 +8,10 @@ use crate::policy::Location;
 /// The most announced addresses of an endpoint that are kept. A host has fewer.
 const MAX_ADDRESSES: usize = 64;
 
+/// The most changes that wait for [`Participant::poll_discovery`](super::Participant::poll_discovery): those
+/// beyond are lost.
+pub const MAX_WAITING_CHANGES: usize = 2_048;
+
 /// A remote reader or writer that was discovered.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Endpoint {

@@ -3,13 +3,19 @@
 use std::collections::HashMap;
 
 use super::graph::{GraphNode, decode_graph};
-use super::reader::{RawReader, TakePayload};
+use super::reader::{KEPT_SMALL_SAMPLES_BYTES, RawReader, TakePayload};
 use crate::model::Guid;
 
 /// The most participants whose entries are kept.
 pub const MAX_PARTICIPANTS: usize = 256;
 /// The most readers and writers that are kept, of all participants together: 1 MiB of GUIDs.
 pub const MAX_GRAPH_ENDPOINTS: usize = 65_536;
+
+/// The most entries that one [`GraphWatch::poll`] takes, so that a flood of them does not delay its caller:
+/// one of each participant. The reader has room for twice as many.
+const MAX_POLLED_ENTRIES: usize = MAX_PARTICIPANTS;
+/// The bytes after which it takes no further entry: half of what the reader keeps.
+const MAX_POLLED_BYTES: usize = KEPT_SMALL_SAMPLES_BYTES / 2;
 
 /// The graph entries of the other participants; created by [`Participant::watch_graph`].
 ///
@@ -36,11 +42,17 @@ impl GraphWatch {
         Self { reader, entries: Entries::default() }
     }
 
-    /// Reads the entries that have arrived since the last call.
+    /// Reads entries that have arrived since the last call: at most 256, or about 2 MiB. The rest waits
+    /// in the reader, where newer entries replace older ones.
     pub fn poll(&mut self) {
-        loop {
+        let mut bytes = 0;
+        for _ in 0..MAX_POLLED_ENTRIES {
+            if bytes >= MAX_POLLED_BYTES {
+                return;
+            }
             match self.reader.take_payload() {
                 TakePayload::Sample(origin, mut payload, encapsulation) => {
+                    bytes += payload.bytes().len();
                     let prefix = origin.writer.prefix();
                     let own_entry = decode_graph(payload.bytes(), encapsulation)
                         .filter(|entry| entry.participant.prefix() == prefix);

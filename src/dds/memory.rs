@@ -57,6 +57,7 @@ pub fn history_bytes(qos: &QosProfile, window_samples: usize, max_sample_bytes: 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::dds::MAX_WAITING_CHANGES;
     use crate::model::History;
 
     #[test]
@@ -70,6 +71,7 @@ mod tests {
             ("rtps/constant.rs", "MAX_WITHHELD_BYTES_PER_TOPIC: usize = 16 * 1024 * 1024;"),
             ("rtps/constant.rs", "MAX_KEPT_BYTES_PER_BUILTIN_TOPIC: usize = 16 * 1024 * 1024;"),
             ("dds/lent.rs", "max_total_bytes: 4 * 1024 * 1024,"),
+            ("dds/participant.rs", &format!("sync_status_channel({MAX_WAITING_CHANGES})?")),
             ("network_counts.rs", "MAX_PARTICIPANTS: usize = 1_024;"),
             ("network_counts.rs", "MAX_ENDPOINTS: usize = 16_384;"),
             ("network_counts.rs", "MAX_ENDPOINT_BYTES: usize = 2_048;"),

@@ -41,10 +41,15 @@ impl Payload {
 /// The largest sample of a topic whose samples have at most some KiB.
 const SMALL_SAMPLE_BYTES: usize = 1 << 20;
 
+/// The complete samples of such a topic that the DDS library keeps, whether they were taken or not: the
+/// newest of this size. With the depth of the reader's history alone, forged ones would take 512 MiB.
+pub(super) const KEPT_SMALL_SAMPLES_BYTES: usize = 4 << 20;
+
 /// The limits of topics whose samples have at most some KiB: graph entries, probes and their responses,
 /// requests. Any host on the network can send fragments that claim larger samples.
 struct SmallSamples {
     max_bytes: usize,
+    max_kept_bytes: Option<usize>,
 }
 
 impl SampleMemory for SmallSamples {
@@ -57,7 +62,7 @@ impl SampleMemory for SmallSamples {
             // With the encapsulation header.
             max_sample_bytes: self.max_bytes + 4,
             max_total_bytes: 4 * self.max_bytes,
-            max_kept_bytes: None,
+            max_kept_bytes: self.max_kept_bytes,
         }
     }
 }
@@ -173,16 +178,20 @@ impl RawReader {
         self.inner.set_sample_memory(memory);
     }
 
-    /// Limits the memory for unfinished samples of the topic to 1 MiB a sample and 4 MiB in all. A larger
-    /// sample is taken without its bytes, as an empty [`Payload::Lent`].
+    /// Limits the memory for unfinished samples of the topic to 1 MiB a sample and 4 MiB in all, and that for
+    /// complete ones to 4 MiB. A larger sample is taken without its bytes, as an empty [`Payload::Lent`].
     pub fn expect_small_samples(&self) {
-        self.expect_samples_up_to(SMALL_SAMPLE_BYTES);
+        self.lend_memory(Arc::new(SmallSamples {
+            max_bytes: SMALL_SAMPLE_BYTES,
+            max_kept_bytes: Some(KEPT_SMALL_SAMPLES_BYTES),
+        }));
     }
 
     /// Limits the memory for unfinished samples of the topic to `max_bytes` a sample and four times that in
-    /// all. A larger sample is taken without its bytes, as an empty [`Payload::Lent`].
+    /// all; the history of the reader limits complete ones. A larger sample is taken without its bytes, as an
+    /// empty [`Payload::Lent`].
     pub fn expect_samples_up_to(&self, max_bytes: usize) {
-        self.lend_memory(Arc::new(SmallSamples { max_bytes }));
+        self.lend_memory(Arc::new(SmallSamples { max_bytes, max_kept_bytes: None }));
     }
 
     /// Takes the next sample, if one waits, and calls `read` once with its payload and encapsulation.
@@ -464,7 +473,7 @@ mod tests {
 
     #[test]
     fn of_small_samples_4_mib_are_assembled_and_larger_ones_are_discarded() {
-        let small = SmallSamples { max_bytes: SMALL_SAMPLE_BYTES };
+        let small = SmallSamples { max_bytes: SMALL_SAMPLE_BYTES, max_kept_bytes: None };
         assert_eq!(small.limits().max_total_bytes, 4 << 20);
         assert!(small.lend(SMALL_SAMPLE_BYTES).is_none());
         let mut too_large = small.lend(SMALL_SAMPLE_BYTES + 1).unwrap();

@@ -8,6 +8,7 @@
 mod cli;
 mod clocks;
 mod demo;
+mod graph;
 mod idle;
 mod metrics;
 mod patterns;

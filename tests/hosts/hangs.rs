@@ -3,13 +3,18 @@
 
 #![cfg(all(target_os = "linux", target_arch = "x86_64"))]
 
+use std::os::unix::net::UnixDatagram;
 use std::process::Command;
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN};
+use support::bridge::program;
+use support::netns::{Net, requires_root};
 use support::peer::{Peer, Received, Sent};
+use support::process::Process;
 use support::threads::{Fault, THREADS, cause, thread};
 
 #[test]
@@ -104,6 +109,73 @@ fn end_while_it_hangs(mut bed: Bed, role: &str) -> Vec<String> {
         let names = log.lines().find_map(|line| Some(line.split_once(killed)?.1));
         names.unwrap_or_else(|| panic!("{log}")).split(", ").map(str::to_owned).collect()
     })
+}
+
+/// Waits until the process that notifies this socket has fed its watchdog so many times.
+fn wait_fed(socket: &UnixDatagram, times: usize) {
+    for _ in 0..times {
+        support::wait_until("a message to the watchdog", || is_fed(socket));
+    }
+}
+
+/// Waits for the next notification, and returns whether it feeds the watchdog.
+fn is_fed(socket: &UnixDatagram) -> bool {
+    let mut message = [0; 1024];
+    let length = socket.recv(&mut message).unwrap_or(0);
+    message[..length].split(|byte| *byte == b'\n').any(|line| line == b"WATCHDOG=1")
+}
+
+/// Kills a process when it has not fed its watchdog for this time, as a service manager does, and returns
+/// true. Kills it and returns false if it feeds the watchdog for longer than a test waits.
+fn watch(socket: &UnixDatagram, process: i32, timeout: Duration) -> bool {
+    let (begun, mut fed_at) = (Instant::now(), Instant::now());
+    while fed_at.elapsed() < timeout && begun.elapsed() < support::patience() {
+        if is_fed(socket) {
+            fed_at = Instant::now();
+        }
+    }
+    let is_starved = fed_at.elapsed() >= timeout;
+    kill(Pid::from_raw(process), Signal::SIGKILL).unwrap();
+    is_starved
+}
+
+/// The responder runs without a bridge, so that only the watchdog of systemd restarts it.
+#[test]
+fn a_responder_in_which_any_thread_hangs_or_ends_does_not_feed_its_watchdog() {
+    let test = "a_responder_in_which_any_thread_hangs_or_ends_does_not_feed_its_watchdog";
+    if let Some(reason) = requires_root() {
+        return support::skip(test, &reason);
+    }
+    // `WatchdogSec` of its unit.
+    let timeout = Duration::from_secs(5);
+    let net = Net::new(&["laptop"]);
+    let check = |fault: Fault, name: Option<&str>| {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("notify");
+        let socket = UnixDatagram::bind(&path).unwrap();
+        socket.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
+        let mut command = net.host("laptop").command(program());
+        command.args(["responder", "--id", "laptop"]).env_remove("ADAPTIVE_BRIDGE_CONFIG");
+        command.env("NOTIFY_SOCKET", &path).env("WATCHDOG_USEC", timeout.as_micros().to_string());
+        let responder = Process::spawn("responder", command);
+        wait_fed(&socket, 3);
+        let process = responder.pid().as_raw();
+        std::thread::scope(|scope| {
+            let watch = scope.spawn(|| watch(&socket, process, timeout));
+            // Returns when the process is dead, or at once if its main thread has ended.
+            cause(fault, process, thread(process, name));
+            let is_starved = watch.join().unwrap();
+            assert!(is_starved, "fed its watchdog after {fault:?} of thread {name:?}:\n{}", responder.log());
+        });
+    };
+    std::thread::scope(|scope| {
+        for fault in [Fault::Hang, Fault::End] {
+            for name in THREADS {
+                let check = &check;
+                scope.spawn(move || check(fault, name));
+            }
+        }
+    });
 }
 
 /// Turns off the grouping of processes by session, in which a busy process leaves others their share; until

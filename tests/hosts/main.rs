@@ -8,6 +8,7 @@ mod control_faults;
 mod crowds;
 mod cut_through;
 mod faults;
+mod floods;
 mod forged_participants;
 mod fragments;
 mod hangs;

@@ -10,6 +10,7 @@
 pub mod bed;
 pub mod bridge;
 pub mod flow;
+pub mod forger;
 pub mod impairment;
 pub mod machine;
 pub mod netns;

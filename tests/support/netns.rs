@@ -318,3 +318,18 @@ pub fn udp_ports(pid: i32) -> Vec<u16> {
     ports.dedup();
     ports
 }
+
+/// The UDP ports of the sockets of one process.
+pub fn udp_ports_of(pid: i32) -> Vec<u16> {
+    let files = fs::read_dir(format!("/proc/{pid}/fd")).unwrap().flatten();
+    let targets: Vec<_> = files.filter_map(|file| fs::read_link(file.path()).ok()).collect();
+    let is_own =
+        |inode: &str| targets.iter().any(|target| target.as_os_str() == &*format!("socket:[{inode}]"));
+    let table = fs::read_to_string(format!("/proc/{pid}/net/udp")).unwrap();
+    let port = |line: &str| {
+        let mut fields = line.split_whitespace();
+        let port = fields.nth(1)?.rsplit(':').next()?;
+        is_own(fields.nth(7)?).then(|| u16::from_str_radix(port, 16).ok())?
+    };
+    table.lines().skip(1).filter_map(port).collect()
+}

@@ -13,7 +13,7 @@ pub type Prefix = [u8; 12];
 /// The part of a GUID that identifies the reader or writer.
 pub type EntityId = [u8; 4];
 
-pub(super) const PARTICIPANT: EntityId = [0, 0, 1, 0xc1];
+pub const PARTICIPANT: EntityId = [0, 0, 1, 0xc1];
 pub(super) const SPDP_WRITER: EntityId = [0, 1, 0, 0xc2];
 pub(super) const SPDP_READER: EntityId = [0, 1, 0, 0xc7];
 /// The reader and the writer of announcements of writers.
@@ -85,8 +85,12 @@ impl NumberSet {
 }
 
 /// A fragment of a sample, with what it claims of the sample.
-pub struct Fragment {
+pub struct Fragment<'a> {
+    /// Its number, from 1 on.
+    pub number: u32,
+    pub bytes: &'a [u8],
     pub sequence: i64,
+    /// The size of each fragment of the sample; only the last one may be shorter.
     pub size: u16,
     pub sample_bytes: u32,
 }
@@ -174,16 +178,16 @@ impl Message {
         self.submessage(kind::DATA, 0x05, &body)
     }
 
-    /// Adds DATA_FRAG: the first fragment of a sample, of zeros.
-    pub fn first_fragment(self, reader: EntityId, writer: EntityId, fragment: &Fragment) -> Self {
+    /// Adds DATA_FRAG: a fragment of a sample.
+    pub fn fragment(self, reader: EntityId, writer: EntityId, fragment: &Fragment<'_>) -> Self {
         // Fields of this length follow before the inline QoS (RTPS 2.5, clause 9.4.5.5).
         let mut body = [0_u16, 28].map(u16::to_le_bytes).concat();
         body.extend([reader, writer].concat());
         body.extend(number(fragment.sequence));
-        body.extend(1_u32.to_le_bytes());
+        body.extend(fragment.number.to_le_bytes());
         body.extend([1, fragment.size].map(u16::to_le_bytes).concat());
         body.extend(fragment.sample_bytes.to_le_bytes());
-        body.resize(body.len() + usize::from(fragment.size), 0);
+        body.extend(fragment.bytes);
         self.submessage(kind::DATA_FRAG, 0x01, &body)
     }
 

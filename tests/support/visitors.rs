@@ -135,7 +135,7 @@ impl Visitors {
                     for (number, endpoint) in self.endpoints.iter().enumerate() {
                         if endpoint.is_writer == writers {
                             sequence += 1;
-                            let described = describe(*prefix, number, endpoint, address);
+                            let described = describe(*prefix, endpoint.entity(number), endpoint, address);
                             message = message.data(reader, writer, sequence, &described);
                         }
                     }
@@ -246,10 +246,15 @@ fn guid(prefix: Prefix, entity: EntityId) -> [u8; 16] {
 }
 
 /// The announcement of an endpoint.
-fn describe(prefix: Prefix, number: usize, endpoint: &Endpoint, address: SocketAddrV4) -> Parameters {
+pub(super) fn describe(
+    prefix: Prefix,
+    entity: EntityId,
+    endpoint: &Endpoint,
+    address: SocketAddrV4,
+) -> Parameters {
     let reliability = if endpoint.is_reliable { RELIABLE } else { BEST_EFFORT };
     Parameters::default()
-        .with(pid::ENDPOINT_GUID, &guid(prefix, endpoint.entity(number)))
+        .with(pid::ENDPOINT_GUID, &guid(prefix, entity))
         .with(pid::PARTICIPANT_GUID, &guid(prefix, PARTICIPANT))
         .with_text(pid::TOPIC_NAME, endpoint.topic)
         .with_text(pid::TYPE_NAME, endpoint.type_name)

@@ -209,7 +209,10 @@ impl EndpointMonitor {
         let mut changed = false;
         for (number, (network, participant)) in self.networks.iter_mut().zip(participants).enumerate() {
             let mut are_addresses_current = false;
-            while let Some(change) = participant.poll_discovery() {
+            // The rest of a flood of changes waits for the next housekeeping, and the other work of control
+            // does not wait for it.
+            for _ in 0..dds::MAX_WAITING_CHANGES {
+                let Some(change) = participant.poll_discovery() else { break };
                 // Reads the addresses once for each batch of events: after a change of this host's address, a
                 // local endpoint that is announced again would otherwise be taken for a remote one.
                 if !are_addresses_current {

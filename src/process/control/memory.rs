@@ -3,8 +3,8 @@
 pub(in crate::process) use super::networks;
 use super::parameters;
 
-/// The readers of a network's probes and graph entries: messages of some KiB, and unfinished ones of 4 MiB.
-/// Forged messages that are larger than any of a ROS 2 node may need more; the limit then ends control.
+/// The readers of a network's probes and graph entries: of each 4 MiB of complete messages and 4 MiB of
+/// unfinished ones, and 16 MiB of graph entries that wait for an earlier one.
 pub(in crate::process) const REQUESTS_BYTES: u64 = 32 << 20;
 
 /// The parameter services of a node.
