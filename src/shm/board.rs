@@ -79,7 +79,7 @@ pub enum Stage {
 }
 
 /// Incremented whenever the meaning of a word in the segment changes.
-const LAYOUT_VERSION: u32 = 15;
+const LAYOUT_VERSION: u32 = 16;
 /// The readers of a route: one for the publishers of each reliability.
 const READERS: usize = 2;
 /// "ABboards": the first word, by which a file of another program is rejected.

@@ -66,7 +66,7 @@ plain! {
     PartialSample: 11 + 16,
     Backlog: 4 + 16,
     IngressCounters: 4 + DropReason::COUNT + 4 + 9 + 5 + 3 + 2,
-    LaneCounters: 6 + DropReason::COUNT + 8,
+    LaneCounters: 6 + DropReason::COUNT + 9,
     OutputReaders: MAX_OUTPUT_READERS * (6 + 2) + MAX_UNMATCHED_READERS * 3 + 2,
     ProcessIdentity: 10,
     EndpointIdentity: 3,

@@ -54,6 +54,7 @@ pub(super) fn wide_report() -> Report {
             readers: 99_999,
             reader_overrun: u64::MAX,
             unconfirmed: u64::MAX,
+            late_joiners_unserved: u64::MAX,
             forwarded: u64::MAX,
             forwarded_bytes: u64::MAX,
             drops: counts(u64::MAX / 100),

@@ -64,6 +64,7 @@ fn report() -> Report {
         readers: 2,
         reader_overrun: 23,
         unconfirmed: 24,
+        late_joiners_unserved: 25,
         ..LaneCounters::default()
     };
     lane.drops.add(DropReason::LaneDown, 5);
@@ -216,6 +217,7 @@ fn the_parser_of_prometheus_reads_the_page() {
         ("lane_subscribers", 2.0),
         ("lane_reader_overrun_samples_total", 23.0),
         ("lane_unconfirmed_samples_total", 24.0),
+        ("lane_late_joiners_unserved_total", 25.0),
         ("lane_offered_samples_total", 99.0),
         ("lane_forwarded_samples_total", 90.0),
         ("lane_forwarded_bytes_total", 9_000.0),

@@ -1,14 +1,14 @@
-//! Forged but well-formed discovery: a million participants that do not exist announce themselves while
-//! samples flow.
+//! Forged but well-formed discovery while samples flow: a million participants that do not exist announce
+//! themselves, and one announces more readers than a process keeps.
 
-use std::net::{SocketAddrV4, UdpSocket};
+use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use adaptive_bridge::config;
 use adaptive_bridge::process::MemoryNeeds;
-use support::bed::{Bed, CRITICAL, INPUT, SCAN};
+use support::bed::{Bed, CRITICAL, INPUT, SCAN, SCAN_TYPE};
 use support::bridge::refused;
 use support::peer::{Peer, Received, Sent};
 use support::process::memory_kib;
@@ -21,6 +21,12 @@ const ROLES: [&str; 4] = ["ingress", "control", "egress-critical", "egress-noncr
 const MAX_GROWTH_KIB: i64 = 32 * 1024;
 /// The most participants that a process evicts: it admits 128 at once and 32 a second from one address.
 const MAX_EVICTED: u64 = 10_000;
+/// The most readers of one participant that a process keeps.
+const MAX_READERS: u16 = 4_096;
+/// Readers beyond those.
+const REFUSED: u16 = 100;
+/// Where the forged participants claim to receive.
+const NOWHERE: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(192, 0, 2, 1), 9);
 
 fn prefix(number: u32) -> Prefix {
     let mut prefix = *b"\x01\x0fforged\0\0\0\0";
@@ -31,7 +37,6 @@ fn prefix(number: u32) -> Prefix {
 /// Announces participants to the processes of the bridge in turn: [`PARTICIPANTS`] within [`ATTACK`], and
 /// more until `stop`. Each fourth round, a participant that the processes know sends the announcement.
 fn announce(socket: &UdpSocket, processes: &[SocketAddrV4], stop: &AtomicBool) {
-    let address = SocketAddrV4::new([192, 0, 2, 1].into(), 9);
     let begin = Instant::now();
     let mut number = 0;
     while number < PARTICIPANTS || !stop.load(Ordering::Relaxed) {
@@ -39,7 +44,7 @@ fn announce(socket: &UdpSocket, processes: &[SocketAddrV4], stop: &AtomicBool) {
         let announced = prefix(number);
         // The first round announces the participants that the others name as their sender.
         let sender = if round > 0 && round.is_multiple_of(4) { prefix(process as u32) } else { announced };
-        let message = Message::of(sender).announcement(announced, address, i64::from(number) + 1, LEASE_S);
+        let message = Message::of(sender).announcement(announced, NOWHERE, i64::from(number) + 1, LEASE_S);
         message.send(socket, processes[process]);
         number += 1;
         if number % 32 == 0 {
@@ -47,6 +52,65 @@ fn announce(socket: &UdpSocket, processes: &[SocketAddrV4], stop: &AtomicBool) {
             std::thread::sleep(due.saturating_sub(begin.elapsed()));
         }
     }
+}
+
+/// Announces a participant and its readers with these numbers to all processes of the bridge. Those that have
+/// an announcement already discard its repetition.
+fn announce_readers(socket: &UdpSocket, processes: &[SocketAddrV4], numbers: &[u16]) {
+    let owner = prefix(0);
+    let participant = Message::of(owner).announcement(owner, NOWHERE, 1, LEASE_S);
+    let readers = numbers.chunks(6).map(|numbers| {
+        numbers.iter().fold(Message::of(owner), |message, number| {
+            let [high, low] = number.to_be_bytes();
+            let sequence = i64::from(*number);
+            message.reader(owner, [high, low, 1, 0x04], "rt/forged", SCAN_TYPE, NOWHERE, sequence)
+        })
+    });
+    for message in std::iter::once(participant).chain(readers) {
+        for process in processes {
+            message.send(socket, *process);
+        }
+    }
+}
+
+#[test]
+fn each_process_counts_the_readers_of_a_participant_beyond_its_limit() {
+    let test = "each_process_counts_the_readers_of_a_participant_beyond_its_limit";
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    bed.up.wait_for_log("control is up");
+    let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
+    critical.wait_received(50);
+
+    let (socket, processes) = (bed.host("slow").udp_socket(), bed.discovery_addresses());
+    let numbers: Vec<u16> = (1..=MAX_READERS + REFUSED).collect();
+    for batch in numbers.chunks(500) {
+        // Again, because the network may lose datagrams, and the first ones come before the participant is
+        // known.
+        for _ in 0..3 {
+            announce_readers(&socket, &processes, batch);
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+    let counted = || {
+        let status = bed.bridge.status();
+        ROLES.map(|role| refused(&status, role, "too_many_endpoints"))
+    };
+    support::wait_until("all processes to refuse the readers beyond the limit", || {
+        announce_readers(&socket, &processes, &numbers);
+        counted() == [u64::from(REFUSED); ROLES.len()]
+    });
+
+    // The readers of other participants are not refused.
+    let late = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+    late.wait_received(50);
+    assert_eq!(counted(), [u64::from(REFUSED); ROLES.len()]);
+    let sent: Sent = publisher.end();
+    critical.wait_received(sent.ok);
+    critical.end::<Received>().assert_all_of(&sent);
+    late.end::<Received>().assert_sound();
+    bed.wait_accounted();
+    bed.end();
 }
 
 /// Tests of a minute or more: `make test-long`.

@@ -127,6 +127,31 @@ impl Message {
         self.data(SPDP_READER, SPDP_WRITER, sequence, &participant)
     }
 
+    /// Adds the announcement (SEDP) of a RELIABLE, VOLATILE reader of a participant, which receives at
+    /// `address`.
+    pub fn reader(
+        self,
+        participant: Prefix,
+        reader: EntityId,
+        topic: &str,
+        type_name: &str,
+        address: SocketAddrV4,
+        sequence: i64,
+    ) -> Self {
+        let guid = |entity: EntityId| [participant.as_slice(), &entity].concat();
+        let reliable_100_ms = [2, 0, 429_496_730].map(u32::to_le_bytes).concat();
+        let reader = Parameters::default()
+            .with(pid::ENDPOINT_GUID, &guid(reader))
+            .with(pid::PARTICIPANT_GUID, &guid(PARTICIPANT))
+            .with_text(pid::TOPIC_NAME, topic)
+            .with_text(pid::TYPE_NAME, type_name)
+            .with(pid::RELIABILITY, &reliable_100_ms)
+            .with(pid::DURABILITY, &[0; 4])
+            .with_locator(pid::UNICAST_LOCATOR, address);
+        let (to, from) = SEDP_SUBSCRIPTIONS;
+        self.data(to, from, sequence, &reader)
+    }
+
     /// Adds INFO_DST: the following submessages are for a given participant.
     pub fn to(self, destination: Prefix) -> Self {
         self.submessage(kind::INFO_DST, 0x01, &destination)
@@ -342,23 +367,15 @@ impl ForgedReader {
     /// Announces the participant by multicast (SPDP), and its reader of a topic to all participants that have
     /// announced themselves (SEDP).
     pub fn announce_endpoint(&self, topic: &str, type_name: &str) {
-        let guid = |entity: EntityId| [self.prefix.as_slice(), &entity].concat();
         let announcement = Message::of(self.prefix).announcement(self.prefix, self.address, 1, LEASE_S);
         self.send(&announcement, SPDP_MULTICAST);
 
-        let reliable_100_ms = [2, 0, 429_496_730].map(u32::to_le_bytes).concat();
-        let reader = Parameters::default()
-            .with(pid::ENDPOINT_GUID, &guid(READER))
-            .with(pid::PARTICIPANT_GUID, &guid(PARTICIPANT))
-            .with_text(pid::TOPIC_NAME, topic)
-            .with_text(pid::TYPE_NAME, type_name)
-            .with(pid::RELIABILITY, &reliable_100_ms)
-            .with(pid::DURABILITY, &[0; 4])
-            .with_locator(pid::UNICAST_LOCATOR, self.address);
         let (to, from) = SEDP_SUBSCRIPTIONS;
         for (prefix, announced) in &self.announced {
-            let endpoint =
-                Message::of(self.prefix).to(*prefix).data(to, from, 1, &reader).heartbeat(to, from, 1, 1, 1);
+            let endpoint = Message::of(self.prefix)
+                .to(*prefix)
+                .reader(self.prefix, READER, topic, type_name, self.address, 1)
+                .heartbeat(to, from, 1, 1, 1);
             self.send(&endpoint, announced.discovery);
         }
     }

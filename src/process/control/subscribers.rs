@@ -374,3 +374,94 @@ fn log(subscriber: &Subscriber, transition: &Transition, settings: &Settings) {
         info!(subscriber = id, lane, from, to, reason, "subscriber state changed");
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::probes::Trust;
+    use super::*;
+    use crate::dds::Participant;
+    use crate::policy::FORGET_UNLISTED_MS;
+    use crate::process::role::participant_options;
+    use crate::process::test_role::{self, SCAN};
+    use crate::shm::ProcessRole;
+
+    /// The time between two probes, after each of which control evaluates.
+    const STEP_MS: u64 = 200;
+
+    /// The subscribers of a control process whose clock is `now`.
+    struct Bench {
+        subscribers: Subscribers,
+        link: Link,
+        trust: Trust,
+        now: MonotonicNs,
+    }
+
+    impl Bench {
+        /// Probes and evaluates for some time. The `responders` answer each probe after 5 ms. After each
+        /// evaluation, `see` gets the known subscribers.
+        fn run(&mut self, settings: &Settings, ms: u64, responders: &[&str], see: impl Fn(&[Subscriber])) {
+            for _ in 0..ms / STEP_MS {
+                self.link.send(&mut self.trust).unwrap();
+                let probe = self.link.probes.back_mut().unwrap();
+                probe.sent_at = self.now;
+                self.subscribers.on_probe_sent(0, probe.seq, probe.sent_at);
+                let (seq, arrived_at) = (probe.seq, self.now.plus_ms(5));
+                for id in responders {
+                    let response = Response { responder_id: (*id).to_owned(), seq, arrived_at };
+                    self.subscribers.on_response(0, &self.link, &response, settings).unwrap();
+                }
+                self.now = self.now.plus_ms(STEP_MS);
+                self.subscribers.expected_awake_at = self.now;
+                self.subscribers.evaluate(settings, self.now, |_| ());
+                see(&self.subscribers.list);
+            }
+        }
+
+        fn ids(&self) -> Vec<&str> {
+            self.subscribers.list.iter().map(|subscriber| subscriber.id.as_str()).collect()
+        }
+    }
+
+    #[test]
+    fn an_override_of_a_responder_that_is_not_listed_outlasts_its_silence() {
+        let yaml = format!("{SCAN}\nclassifier: {{enabled: true}}");
+        let (role, settings, _folder) = test_role::open(ProcessRole::Control, "control", 149, &yaml);
+        let options = participant_options(&settings, &settings.lanes[0].network, "control");
+        let mut participant = Participant::open(&options).unwrap();
+        let links = vec![0; settings.lanes.len()];
+        for forced in [SubscriberState::Critical, SubscriberState::Noncritical] {
+            let now = MonotonicNs(1_000_000_000_000);
+            let mut bench = Bench {
+                subscribers: Subscribers::new(&role.boards, &settings, &links, now),
+                link: Link::open(&mut participant, &settings).unwrap(),
+                trust: super::super::load_trust(&settings, None).unwrap(),
+                now,
+            };
+            bench.run(&settings, 20_000, &["laptop", "tablet"], |_| ());
+            assert_eq!(bench.ids(), ["laptop", "tablet"]);
+            let state =
+                |subscriber: &Subscriber| subscriber.classifier.state(&settings.classifier.thresholds);
+            assert!(bench.subscribers.list.iter().all(|one| state(one) == SubscriberState::Critical));
+
+            // While the laptop is silent the classifier says NONCRITICAL, and when it answers CRITICAL.
+            let mut overridden = settings.clone();
+            overridden.overrides.insert("laptop".to_owned(), forced);
+            bench.subscribers.apply(&overridden, &links, bench.now);
+            let holds = |known: &[Subscriber]| {
+                let laptop = known.iter().find(|subscriber| subscriber.id == "laptop");
+                assert_eq!(laptop.map(state), Some(forced));
+            };
+            bench.run(&overridden, FORGET_UNLISTED_MS + 10_000, &[], holds);
+            assert_eq!(bench.ids(), ["laptop"], "the tablet was silent for so long that it is forgotten");
+            bench.run(&overridden, 20_000, &["laptop", "tablet"], holds);
+            assert_eq!(bench.ids(), ["laptop", "tablet"]);
+
+            // Without the override it is a responder like others.
+            bench.subscribers.apply(&settings, &links, bench.now);
+            bench.run(&settings, 20_000, &["laptop", "tablet"], |_| ());
+            assert!(bench.subscribers.list.iter().all(|one| state(one) == SubscriberState::Critical));
+            bench.run(&settings, FORGET_UNLISTED_MS + 10_000, &[], |_| ());
+            assert_eq!(bench.ids(), [""; 0]);
+        }
+    }
+}

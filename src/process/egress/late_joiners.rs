@@ -16,8 +16,8 @@ use crate::model::{Encapsulation, Guid, MonotonicNs, SampleHeader, SampleKey, So
 const SETTLING_MS: u64 = 1_000;
 
 /// The most late joiners that may wait at once, 24 bytes each. Further ones get no history, which the lane
-/// logs.
-const MAX_WAITING: usize = 4_096;
+/// counts and logs.
+pub(super) const MAX_WAITING: usize = 4_096;
 
 /// The most bytes of samples of several publishers, here and in the history of a RELIABLE writer. The last
 /// `depth` samples are kept whatever their size.

@@ -165,6 +165,8 @@ fn outputs(page: &mut Page, report: &Report) {
     each("lane_reader_overrun_samples_total", Counter, help, |output| output.counters.reader_overrun);
     let help = "The most forwarded samples that one subscriber may have missed because a process ended.";
     each("lane_unconfirmed_samples_total", Counter, help, |output| output.counters.unconfirmed);
+    let help = "Late joiners that get no history, because too many others waited for it.";
+    each("lane_late_joiners_unserved_total", Counter, help, |output| output.counters.late_joiners_unserved);
     let help = "Samples offered to the lane.";
     each("lane_offered_samples_total", Counter, help, |output| output.received);
     let help = "Samples given to DDS.";

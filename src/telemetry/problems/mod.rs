@@ -49,6 +49,7 @@ pub(super) fn of(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
     problems.extend(now.routes.iter().filter_map(publishers::never_served));
     for (route, output) in outputs(now) {
         problems.extend(readers::unmatched(route, output, now));
+        problems.extend(readers::without_history(route, output, now, before));
         slow_readers(route, output, now, before, &mut problems);
     }
     problems.extend(control::settings(now, before));

@@ -1,7 +1,9 @@
-//! Problems of subscribers that get nothing from an output.
+//! Problems of subscribers that get nothing from an output, or not its history.
 
 use super::super::problem::{Level, Problem};
 use super::super::snapshot::{OutputReading, RouteReading, Snapshot};
+use super::super::text::counted;
+use super::{about_lane, window_text};
 use crate::model::{TrafficClass, UnmatchedPolicy};
 
 /// The readers of an output's topic that request a stricter QoS than the lane offers.
@@ -23,6 +25,29 @@ pub(super) fn unmatched(
             cause(policy, &format!("qos_overrides.{lane} of topic {route}"))
         );
         Problem::new(format!("lane {lane}"), level, text)
+    })
+}
+
+/// Late joiners within the window for which the output had no place to wait for its history.
+pub(super) fn without_history(
+    route: &RouteReading,
+    output: &OutputReading,
+    now: &Snapshot,
+    before: &Snapshot,
+) -> Option<Problem> {
+    let lane = &now.lanes[output.lane];
+    let earlier = before.route(route)?.output(output)?.counters.late_joiners_unserved;
+    let unserved = output.counters.late_joiners_unserved.checked_sub(earlier)?;
+    (unserved > 0).then(|| {
+        let text = format!(
+            "lane {}, {}: {} in the last {} without the history, because too many others waited for it \
+             (late_joiners_unserved): new samples reach them; restart those that need the history",
+            lane.name,
+            output.topic,
+            counted(unserved, "late joiner"),
+            window_text(now, before)
+        );
+        Problem::new(about_lane(lane), Level::Warn, text)
     })
 }
 
@@ -49,7 +74,7 @@ fn cause(policy: UnmatchedPolicy, overrides: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::problems_after;
+    use super::super::tests::{healthy, problems_after};
     use super::*;
     use crate::model::{FixedText, Guid, NamedEndpoint, UnmatchedReader};
 
@@ -72,5 +97,16 @@ mod tests {
              qos_overrides.noncritical of topic scan, or change the subscriber's QoS",
         ];
         assert_eq!(problems, expected);
+    }
+    #[test]
+    fn late_joiners_without_the_history_are_a_problem_while_their_number_rises() {
+        let problems = problems_after(|now| now.routes[0].outputs[0].counters.late_joiners_unserved = 3);
+        let expected = "lane critical, /c/scan: 3 late joiners in the last 1.0 s without the history, because too \
+                        many others waited for it (late_joiners_unserved): new samples reach them; restart those \
+                        that need the history";
+        assert_eq!(problems, [expected]);
+        let mut unchanged = healthy();
+        unchanged.routes[0].outputs[0].counters.late_joiners_unserved = 3;
+        assert_eq!(super::super::of(&unchanged, &unchanged), []);
     }
 }

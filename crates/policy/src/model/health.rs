@@ -179,6 +179,8 @@ pub struct LaneCounters {
     /// Of those, the ones that it gave up, because another sample came first or they never became complete.
     /// Those that became complete later were sent as a whole.
     pub withdrawn: u64,
+    /// Late joiners that get no history, because too many others waited for it when they matched.
+    pub late_joiners_unserved: u64,
     /// The highest RTPS sequence number of a sample that is forwarded or dropped. The next process of the
     /// lane sends the samples after it that are in the send log.
     #[serde(skip)]

@@ -32,6 +32,7 @@ impl Output {
                         if !joined {
                             late_joiners.left(reader);
                         } else if !late_joiners.joined(reader, now) {
+                            self.counters.update(|counters| counters.late_joiners_unserved += 1);
                             warn!(
                                 route = self.id,
                                 lane = self.lane,

@@ -2,6 +2,7 @@
 
 mod catch_up;
 mod former;
+mod late_joiners;
 mod missing;
 
 use super::*;
@@ -466,27 +467,6 @@ fn readers_that_request_more_are_on_the_board_until_they_are_gone() {
         !output.unmatched.contains(&changed)
     });
     assert_eq!(output.unmatched.len(), MAX_UNMATCHED_READERS);
-}
-
-#[test]
-fn a_best_effort_late_joiner_waits_for_the_history_until_it_leaves() {
-    let yaml = "topics: [{id: scan, input_topic: /scan, qos_overrides: \
-                {critical: {reliability: BEST_EFFORT, durability: TRANSIENT_LOCAL}}}]";
-    let mut host = Host::start(143, CRITICAL, yaml);
-    host.announce_type();
-    let mut output = host.open();
-    let due = |output: &mut Output| {
-        let late_joiners = output.history.as_mut().unwrap().late_joiners.as_mut().unwrap();
-        late_joiners.next_due(clock::monotonic().plus_ms(60_000)).map(|(reader, _)| reader)
-    };
-    let first = host.subscribe_with(Reliability::BestEffort, Durability::TransientLocal);
-    wait_readers(&mut output, 1);
-    assert_eq!(due(&mut output), Some(first.reader.guid()));
-    let second = host.subscribe_with(Reliability::BestEffort, Durability::TransientLocal);
-    wait_readers(&mut output, 2);
-    drop(second);
-    wait_readers(&mut output, 1);
-    assert_eq!(due(&mut output), None);
 }
 
 #[test]

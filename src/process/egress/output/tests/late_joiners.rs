@@ -1,0 +1,48 @@
+//! Late joiners of a BEST_EFFORT, TRANSIENT_LOCAL output.
+
+use super::super::super::late_joiners::{LateJoiners, MAX_WAITING};
+use super::*;
+
+const YAML: &str = "topics: [{id: scan, input_topic: /scan, qos_overrides: \
+                    {critical: {reliability: BEST_EFFORT, durability: TRANSIENT_LOCAL}}}]";
+
+/// The late joiners of the output.
+fn waiting(output: &mut Output) -> &mut LateJoiners {
+    output.history.as_mut().unwrap().late_joiners.as_mut().unwrap()
+}
+
+#[test]
+fn a_best_effort_late_joiner_waits_for_the_history_until_it_leaves() {
+    let mut host = Host::start(143, CRITICAL, YAML);
+    host.announce_type();
+    let mut output = host.open();
+    let due = |output: &mut Output| {
+        waiting(output).next_due(clock::monotonic().plus_ms(60_000)).map(|(reader, _)| reader)
+    };
+    let first = host.subscribe_with(Reliability::BestEffort, Durability::TransientLocal);
+    wait_readers(&mut output, 1);
+    assert_eq!(due(&mut output), Some(first.reader.guid()));
+    let second = host.subscribe_with(Reliability::BestEffort, Durability::TransientLocal);
+    wait_readers(&mut output, 2);
+    drop(second);
+    wait_readers(&mut output, 1);
+    assert_eq!(due(&mut output), None);
+}
+
+#[test]
+fn a_late_joiner_for_which_no_place_is_free_is_counted() {
+    let mut host = Host::start(144, CRITICAL, YAML);
+    host.announce_type();
+    let mut output = host.open();
+    let now = clock::monotonic();
+    for number in 1..MAX_WAITING {
+        assert!(waiting(&mut output).joined(Guid((number as u128).to_be_bytes()), now));
+    }
+    let unserved = |output: &Output| output.counters.get().late_joiners_unserved;
+    let _last_place = host.subscribe_with(Reliability::BestEffort, Durability::TransientLocal);
+    wait_readers(&mut output, 1);
+    assert_eq!(unserved(&output), 0);
+    let _no_place = host.subscribe_with(Reliability::BestEffort, Durability::TransientLocal);
+    wait_readers(&mut output, 2);
+    assert_eq!(unserved(&output), 1);
+}
