@@ -38,7 +38,7 @@ use crate::telemetry::{Starvation, StatFile};
 const POLL_MS: u16 = 50;
 
 /// How often a standby checks whether the active process is stopped.
-const STOPPED_POLL_MS: u16 = 4;
+const STOPPED_POLL_MS: u16 = 6;
 
 /// How often a standby checks whether the active process makes progress.
 const PROGRESS_POLL_MS: u64 = 50;
@@ -274,7 +274,7 @@ impl Waiting {
     fn receive(&mut self) -> io::Result<()> {
         let source = self.active.as_ref().map_or(self.listener.as_fd(), |active| active.connection.as_fd());
         let mut polled = [PollFd::new(source, PollFlags::POLLIN)];
-        // Nothing but this check is done so often: it takes a quarter of the CPU time of the rest.
+        // Nothing but this check is done so often: it takes 24 µs of CPU time, most of it for the wake-up.
         let stat = self.active.as_ref().filter(|_| self.fences).and_then(|active| active.stat.as_ref());
         let timeout_ms = if stat.is_some() { STOPPED_POLL_MS } else { POLL_MS };
         let mut waited_ms = 0;
