@@ -156,6 +156,9 @@ pub(crate) struct TopicCache {
   // would need 2^32 receives within it.
   last_added_instant: Timestamp,
 
+  // Samples added since the last collection; a large one counts as several.
+  added_since_collection: usize,
+
   // sequence_numbers is an index to "changes" by GUID and SN
   sequence_numbers: BTreeMap<GUID, BTreeMap<SequenceNumber, Timestamp>>,
 
@@ -193,6 +196,7 @@ impl TopicCache {
       changes: BTreeMap::new(),
       changes_reallocated_up_to: Timestamp::ZERO,
       last_added_instant: Timestamp::ZERO,
+      added_since_collection: 0,
       sequence_numbers: BTreeMap::new(),
       received_reliably_before: BTreeMap::new(),
       lender: Lender::default(),
@@ -412,27 +416,23 @@ impl TopicCache {
   ) -> Option<CacheChange> {
     // First, do garbage collection.
     // But not at every insert, just to save time and effort.
-    // Some heuristic to decide if we should collect now.
-    // let payload_size = max(1, cache_change.data_value.payload_size());
-    let semi_random_number = i64::from(cache_change.sequence_number) as usize;
     // Garbage collect more often when samples are large, so the cache does not
     // balloon between collections for big (e.g. fragmented) payloads:
     //   payload <= 1 KiB   : GC every 64 samples (cheap amortization)
     //   1 KiB < p <= 64 KiB: GC every 8 samples
     //   payload > 64 KiB    : GC on every sample
+    // Samples are counted: their numbers are chosen by the sender, who must not choose
+    // when the cache collects.
     let payload_size = cache_change.data_value.payload_size();
-    let modulus = if payload_size <= 1024 {
-      64
-    } else if payload_size <= 65536 {
+    self.added_since_collection += if payload_size <= 1024 {
+      1
+    } else if payload_size <= 65536 && !self.is_built_in {
       8
     } else {
-      1
+      64
     };
-    // The sender chooses the numbers: it must not choose when its large samples go.
-    let is_large_built_in = self.is_built_in && payload_size > 1024;
-    let gc_triggered =
-      modulus <= 1 || semi_random_number.is_multiple_of(modulus) || is_large_built_in;
-    if gc_triggered {
+    if self.added_since_collection >= 64 {
+      self.added_since_collection = 0;
       debug!("Garbage collecting topic {}", self.topic_name);
       self.remove_changes_before(Timestamp::ZERO);
       // remove limit is so low that it has no effect.
@@ -1042,6 +1042,24 @@ mod tests {
       "{kept} samples"
     );
     assert_eq!(fill(cache_of("rt/scan")), 1_000);
+  }
+
+  // A collection at each 64th number would never come.
+  #[test]
+  fn the_numbers_that_a_sender_chooses_do_not_change_how_many_samples_are_kept() {
+    let mut cache = keep_all_topic_cache();
+    for number in (1..64 * 10_000).step_by(64) {
+      let payload = SerializedPayload::new(RepresentationIdentifier::CDR_LE, vec![0; 100]);
+      let change = CacheChange::new(
+        user_writer(),
+        SequenceNumber::new(number),
+        WriteOptions::default(),
+        DDSData::new(payload),
+      );
+      cache.add_change(&Timestamp::now(), change);
+    }
+    let most = cache.max_keep_samples as usize + 64;
+    assert!(cache.changes.len() <= most, "{} samples, at most {most}", cache.changes.len());
   }
 
   // A History of 1,024 scans may be one of 64 images.
