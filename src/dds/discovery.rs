@@ -12,6 +12,33 @@ const MAX_ADDRESSES: usize = 64;
 /// beyond are lost.
 pub const MAX_WAITING_CHANGES: usize = 2_048;
 
+/// The changes of discovery that the caller still takes before it does its other work: as many as can wait. A
+/// peer that announces and withdraws endpoints as fast as it can keeps no caller in a loop.
+#[derive(Debug)]
+pub struct DiscoveryTurn {
+    left: usize,
+}
+
+impl DiscoveryTurn {
+    /// A turn that takes up to [`MAX_WAITING_CHANGES`].
+    pub const fn new() -> Self {
+        Self { left: MAX_WAITING_CHANGES }
+    }
+
+    /// Whether the turn takes another change, also one that the bridge does not look at, which then counts.
+    pub(super) const fn takes_another(&mut self) -> bool {
+        let takes_another = self.left > 0;
+        self.left = self.left.saturating_sub(1);
+        takes_another
+    }
+}
+
+impl Default for DiscoveryTurn {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 /// A remote reader or writer that was discovered.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Endpoint {
@@ -95,5 +122,17 @@ fn endpoint(description: EndpointDescription, default_reliability: Reliability) 
         type_hash: TypeHash::find_in(&description.user_data),
         topic: description.topic_name,
         dds_type: description.type_name,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_turn_takes_as_many_changes_as_can_wait() {
+        let mut turn = DiscoveryTurn::new();
+        let taken = (0..10_000).filter(|_| turn.takes_another()).count();
+        assert_eq!(taken, MAX_WAITING_CHANGES);
     }
 }

@@ -13,7 +13,7 @@ use bytes::Bytes;
 use futures_core::Stream;
 
 use super::arrivals::Arrivals;
-use super::discovery::{Discovery, translate};
+use super::discovery::{Discovery, DiscoveryTurn, translate};
 use super::error::DdsError;
 use super::graph;
 use super::graph_watch::{GraphWatch, MAX_PARTICIPANTS};
@@ -521,11 +521,11 @@ impl Participant {
         let _ = self.discovery_woken.recv_timeout(most);
     }
 
-    /// Returns the next change that discovery reports, if there is one.
-    pub fn poll_discovery(&self) -> Option<Discovery> {
+    /// Returns the next change that discovery reports, if there is one and `turn` still takes one.
+    pub fn poll_discovery(&self, turn: &mut DiscoveryTurn) -> Option<Discovery> {
         let mut changes = pin!(self.listener.as_async_status_stream());
         let mut context = Context::from_waker(&self.discovery_waker);
-        loop {
+        while turn.takes_another() {
             match changes.as_mut().poll_next(&mut context) {
                 Poll::Ready(Some(change)) => {
                     if let Some(change) = translate(change) {
@@ -535,6 +535,7 @@ impl Participant {
                 Poll::Ready(None) | Poll::Pending => return None,
             }
         }
+        None
     }
 
     fn publish_graph_entry(&self) {

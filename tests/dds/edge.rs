@@ -8,8 +8,9 @@ use std::time::{Duration, Instant};
 
 use adaptive_bridge::config::DdsNetwork;
 use adaptive_bridge::dds::{
-    Arrival, ArrivalFlag, Discovery, Kept, LentMemory, Participant, ParticipantOptions, Payload, RawReader,
-    RawWriter, ReaderEvent, ReaderQos, SampleMemory, Take, TakePayload, WriteError, WriterEvent,
+    Arrival, ArrivalFlag, Discovery, DiscoveryTurn, Kept, LentMemory, Participant, ParticipantOptions,
+    Payload, RawReader, RawWriter, ReaderEvent, ReaderQos, SampleMemory, Take, TakePayload, WriteError,
+    WriterEvent,
 };
 use adaptive_bridge::model::{
     DdsType, Durability, Encapsulation, Guid, History, KeyedPayload, QosProfile, Reliability, SampleKey,
@@ -371,7 +372,7 @@ fn readers_that_are_gone_are_not_announced_to_a_new_participant() {
     // SEDP announces readers in the order of their creation, so the present one comes last.
     while announced.last() != Some(&present.guid()) {
         assert!(Instant::now() < give_up, "the present reader was not announced");
-        match newcomer.poll_discovery() {
+        match newcomer.poll_discovery(&mut DiscoveryTurn::new()) {
             Some(Discovery::Reader(reader)) if reader.topic.starts_with("rt/") => announced.push(reader.guid),
             Some(_) => {}
             None => std::thread::sleep(Duration::from_millis(5)),
@@ -385,7 +386,8 @@ fn a_change_that_discovery_reports_ends_the_wait_for_it() {
     let here = participant("here", 63);
     let mut there = None;
     loop {
-        let changes: Vec<_> = std::iter::from_fn(|| here.poll_discovery()).collect();
+        let mut turn = DiscoveryTurn::new();
+        let changes: Vec<_> = std::iter::from_fn(|| here.poll_discovery(&mut turn)).collect();
         let is_it =
             |change: &Discovery| matches!(change, Discovery::Writer(writer) if writer.topic == "rt/wakes");
         if changes.iter().any(is_it) {

@@ -8,8 +8,8 @@ use std::path::Path;
 use adaptive_bridge::clock;
 use adaptive_bridge::config::DdsNetwork;
 use adaptive_bridge::dds::{
-    Discovery, Endpoint, GraphWatch, Participant, ParticipantOptions, RawReader, ReaderQos, encode_graph,
-    host_addresses,
+    Discovery, DiscoveryTurn, Endpoint, GraphWatch, Participant, ParticipantOptions, RawReader, ReaderQos,
+    encode_graph, host_addresses,
 };
 use adaptive_bridge::model::{Durability, Guid, Reliability, TopicName};
 use adaptive_bridge::policy::{Guarded, GuardedTopic, IntruderEvent, IntruderWatch, Locality};
@@ -60,7 +60,7 @@ fn read(node: &mut Participant, topic: &str) -> RawReader {
 
 /// Adds the readers that a participant has discovered, by topic.
 fn take_in(participant: &Participant, readers: &mut BTreeMap<String, Endpoint>) {
-    while let Some(change) = participant.poll_discovery() {
+    while let Some(change) = participant.poll_discovery(&mut DiscoveryTurn::new()) {
         if let Discovery::Reader(reader) = change
             && !participant.owns(reader.guid)
         {
@@ -151,7 +151,7 @@ impl Turn {
 
     fn take(&mut self) {
         let now = clock::monotonic();
-        while let Some(change) = self.participant.poll_discovery() {
+        while let Some(change) = self.participant.poll_discovery(&mut DiscoveryTurn::new()) {
             match change {
                 Discovery::Reader(reader) => {
                     self.watch.endpoint_discovered(

@@ -11,7 +11,7 @@ use super::super::error::RoleError;
 use super::absences::Absences;
 use super::networks;
 use crate::config::{InputTopic, Lane, NeverInputs, OutputTopic, RoutePattern, Settings};
-use crate::dds::{self, Discovery, Endpoint, GraphWatch, Participant};
+use crate::dds::{self, Discovery, DiscoveryTurn, Endpoint, GraphWatch, Participant};
 use crate::model::{
     FixedText, Guid, IntruderRecord, MAX_INTRUDERS, MAX_NAMED_ENDPOINTS, MonotonicNs, NamedEndpoint,
     ReaderRecord, TopicName, TopicPrefix, TrafficClass,
@@ -209,10 +209,8 @@ impl EndpointMonitor {
         let mut changed = false;
         for (number, (network, participant)) in self.networks.iter_mut().zip(participants).enumerate() {
             let mut are_addresses_current = false;
-            // The rest of a flood of changes waits for the next housekeeping, and the other work of control
-            // does not wait for it.
-            for _ in 0..dds::MAX_WAITING_CHANGES {
-                let Some(change) = participant.poll_discovery() else { break };
+            let mut turn = DiscoveryTurn::new();
+            while let Some(change) = participant.poll_discovery(&mut turn) {
                 // Reads the addresses once for each batch of events: after a change of this host's address, a
                 // local endpoint that is announced again would otherwise be taken for a remote one.
                 if !are_addresses_current {

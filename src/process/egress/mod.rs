@@ -37,7 +37,7 @@ use super::standby::Leave;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{self, Configuration, Forwarding, Lane, Settings};
-use crate::dds::{Discovery, Participant, ParticipantOptions};
+use crate::dds::{Discovery, DiscoveryTurn, Participant, ParticipantOptions};
 use crate::model::{Guid, LaneCounters, LaneMode, LaneName, LanePolicy, MonotonicNs, TrafficClass};
 use crate::policy::mode_and_source;
 use crate::shm::{Boards, LaneSleeper, ProcessRole};
@@ -349,7 +349,8 @@ impl Egress {
     fn housekeeping(&mut self, now: MonotonicNs) {
         let mut gone = Vec::new();
         let mut discovery_changed = false;
-        while let Some(change) = self.participant.poll_discovery() {
+        let mut turn = DiscoveryTurn::new();
+        while let Some(change) = self.participant.poll_discovery(&mut turn) {
             discovery_changed = true;
             if matches!(change, Discovery::ReaderGone(_) | Discovery::ParticipantGone { .. }) {
                 gone.push(change);

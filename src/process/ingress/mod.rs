@@ -32,7 +32,7 @@ use super::standby::Leave;
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{InputTopic, Route, Settings};
-use crate::dds::{ArrivalFlag, Discovery, Participant};
+use crate::dds::{ArrivalFlag, Discovery, DiscoveryTurn, Participant};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
 use crate::shm::{Boards, PoolBudget, ProcessRole, ShmError, ShmNode};
 use early_waker::EarlyWaker;
@@ -219,7 +219,8 @@ impl Ingress {
 
     fn housekeeping(&mut self, now: MonotonicNs) -> Result<(), RoleError> {
         let mut discovery_changed = false;
-        while let Some(change) = self.participant.poll_discovery() {
+        let mut turn = DiscoveryTurn::new();
+        while let Some(change) = self.participant.poll_discovery(&mut turn) {
             discovery_changed = true;
             match change {
                 Discovery::Writer(writer) if !self.participant.owns(writer.guid) => {
