@@ -203,8 +203,15 @@ impl Egress {
             let joined = join(&mut role, lane, process, role_name, &options);
             (queues.join(), joined)
         });
+        let queues = match queues.unwrap_or_else(|panic| std::panic::resume_unwind(panic)) {
+            Ok(queues) => queues,
+            Err(error) => {
+                // As if the process were killed, so that the next process can continue it.
+                std::mem::forget((joined, role));
+                return Err(error.into());
+            }
+        };
         let (mut participant, identity) = joined?;
-        let queues = queues.unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
         let mut outputs = Vec::with_capacity(lane.outputs.len());
         let mut more_urgent = Vec::with_capacity(lane.outputs.len());
         let priority = |output: &config::Output| settings.routes[output.route].priority;

@@ -161,15 +161,14 @@ impl Ingress {
             let joined = Identity::join(&mut role, ProcessRole::Ingress, NAME, &options, standby, open);
             (pools.join(), joined)
         });
-        let pools = match pools {
-            Ok(Ok(pools)) => pools,
-            Ok(Err(error)) => {
-                // As if the process were killed: what is dropped would say goodbye, and the next process
-                // could not continue the former one.
-                std::mem::forget(joined);
+        let pools = match pools.unwrap_or_else(|panic| std::panic::resume_unwind(panic)) {
+            Ok(pools) => pools,
+            Err(error) => {
+                // As if the process were killed: dropped, the participant would say goodbye, and the role
+                // would record a regular end. After either, the next process could not continue it.
+                std::mem::forget((joined, role));
                 return Err(error.into());
             }
-            Err(panic) => std::panic::resume_unwind(panic),
         };
         let (participant, identity, continued) = joined?;
         let mut inputs = Vec::with_capacity(settings.routes.len());
