@@ -106,9 +106,9 @@ pub(super) fn settings(now: &Snapshot, before: &Snapshot) -> Vec<Problem> {
             let meaning = reason.meaning();
             let effect = match reason {
                 NetworkRefusal::UnfinishedSample => {
-                    "so many large samples lose fragments on their way, or a host sends parts of samples; \
-                     `tcpdump -n udp` shows from where; max_sample_bytes of routes with small samples bounds what \
-                     they may claim"
+                    "large samples lose fragments on their way, or a host sends parts of samples or \
+                     announcements; `tcpdump -n udp` shows from where; if all inputs together exceed their limit, \
+                     a smaller max_sample_bytes of routes with small samples leaves more for the others"
                 }
                 _ => {
                     "nodes that start now may not be found; `tcpdump -n udp portrange 7400-7500` shows which host \

@@ -51,7 +51,7 @@ pub struct NetworkCounts {
   /// Unfinished samples that were discarded for a limit: 128 of a Writer, the memory of a
   /// reader, or that of all readers together
   /// ([`with_max_unfinished_bytes`](crate::DomainParticipantBuilder::with_max_unfinished_bytes)).
-  /// Not those of which the rest never came.
+  /// Not those that are discarded below all limits because no fragment came for 10 s.
   pub unfinished_discarded: u64,
 }
 

@@ -15,7 +15,8 @@ reasons! {
     EvictedParticipant = "evicted_participant", "participants removed to make room for new ones",
     /// An announcement of an endpoint or a topic without room for another one.
     TooManyEndpoints = "too_many_endpoints", "announcements of readers, writers and topics refused",
-    /// A sample of which fragments were missing, discarded because all of those needed too much memory.
+    /// A sample or announcement of which fragments were missing, discarded because its writer had too many of
+    /// them, or because those of its topic or of all inputs needed too much memory.
     UnfinishedSample = "unfinished_sample", "samples discarded of which fragments were missing",
 }
 
