@@ -49,6 +49,17 @@ fn h1_is_partly_confirmed_or_contradicted() {
 }
 
 #[test]
+fn h1_is_partly_confirmed_if_a_rule_does_not_hold_at_one_place() {
+    let mut runs = baselines("as-run", 20.0, 12_000.0);
+    runs.push(MadeUp { library: "cyclone", ..MadeUp::default() });
+    let there = MadeUp { library: "cyclone", reading: "as-run", rate_hz: 20.0, ..MadeUp::default() };
+    runs.push(MadeUp { scenario: "baseline_strong", tail_ms: 12_000.0, ..there.clone() });
+    assert_eq!(finding(&runs, 1).verdict, Verdict::Confirmed);
+    runs.push(MadeUp { scenario: "baseline_mild", ..there });
+    assert_eq!(finding(&runs, 1).verdict, Verdict::Partly);
+}
+
+#[test]
 fn the_longest_silence_is_that_of_one_run_and_no_median() {
     let mut runs = baselines("as-run", 20.0, 12_000.0);
     for lost in [0, 59] {
