@@ -73,11 +73,16 @@ fn pause() {
 }
 
 fn start(test: &str) -> Option<(Bed, Client)> {
+    start_with(test, "")
+}
+
+/// Starts the bridge with more lines of configuration.
+fn start_with(test: &str, yaml: &str) -> Option<(Bed, Client)> {
     if let Some(reason) = ros::missing() {
         support::skip(test, &reason);
         return None;
     }
-    let bed = Bed::start(test, &format!("{SCAN}{PROBES}"))?;
+    let bed = Bed::start(test, &format!("{SCAN}{PROBES}{yaml}"))?;
     let client = Client::start(&bed);
     Some((bed, client))
 }
@@ -179,6 +184,26 @@ fn a_parameter_that_is_set_reaches_all_processes_and_stays_until_the_bridge_ends
     // With the value of the file the parameter is no longer in place of it.
     client.set_applied(&bed, &json!({ "lanes.noncritical.max_rate_hz": 10.0 }));
     bed.bridge.wait_status("no parameter set", |status| set(status) == json!([]));
+    bed.end();
+}
+
+#[test]
+fn no_parameter_can_be_set_if_messages_are_signed_and_unknown_senders_denied() {
+    let test = "no_parameter_can_be_set_if_messages_are_signed_and_unknown_senders_denied";
+    let signed = "security: {trust_mode: default_deny, enable_probe_hmac: true, \
+                  hmac_secret_file: '{folder}/secret'}\n";
+    let Some((bed, mut client)) = start_with(test, signed) else { return };
+    let results = client.set(&bed, json!({ "probes.rate_hz": 5.0, "lanes.noncritical.max_rate_hz": 7.0 }));
+    for index in [0, 1] {
+        let reason = refused(&results, index);
+        assert!(
+            reason.starts_with("security.trust_mode is default_deny: requests cannot be signed"),
+            "{reason}"
+        );
+    }
+    let names = ["probes.rate_hz", "lanes.noncritical.max_rate_hz"];
+    assert_eq!(client.values(&bed, &names), json!([4.0, 10.0]));
+    assert_eq!(bed.bridge.status()["parameters"]["set"], json!([]));
     bed.end();
 }
 
