@@ -24,6 +24,8 @@ const STANDBYS: [&str; 2] =
     ["adaptive-bridge-standby-ingress.service", "adaptive-bridge-standby-critical.service"];
 const RESPONDER: &str = "adaptive-bridge-responder@laptop.service";
 
+/// The rate of the publisher.
+const RATE_HZ: f64 = 200.0;
 const CONFIG: &str = "/etc/adaptive-bridge/config.yaml";
 
 /// A message of a reload that does not apply a change.
@@ -83,11 +85,13 @@ impl Bed {
         let slow = subscriber("slow", Peer::fast().best_effort(), NONCRITICAL);
         // KEEP_LAST, as ROS 2 has it: a KEEP_ALL writer waits for an ingress that is stopped, until that is
         // restarted.
-        let publisher = Peer::cyclone().rate_hz(200.0).publisher().topic(INPUT).wait_match(1);
+        let direct = subscriber("slow", Peer::fast(), INPUT);
+        let publisher = Peer::cyclone().rate_hz(RATE_HZ).publisher().topic(INPUT).wait_match(2);
         let publisher = publisher.start_on(self.net.host("publisher"));
         critical.wait_received(50);
         slow.wait_received(3);
-        Flow { publisher, critical, slow }
+        direct.wait_received(50);
+        Flow { publisher, critical, slow, direct }
     }
 
     /// Waits until a unit was restarted `restarts` times and is active again.
@@ -97,11 +101,12 @@ impl Bed {
     }
 }
 
-/// A publisher at 200 Hz, a critical and a remote subscriber.
+/// A publisher, a critical and a remote subscriber, and one that receives without the bridge.
 struct Flow {
     publisher: RunningPeer,
     critical: RunningPeer,
     slow: RunningPeer,
+    direct: RunningPeer,
 }
 
 impl Flow {
@@ -121,6 +126,13 @@ impl Flow {
         self.critical.wait_received(self.critical.received() + samples);
     }
 
+    /// Asserts that the publisher has written at a quarter of its rate at least for the time since `began`, when
+    /// it had written `before` samples: one that waits for a stopped process writes none meanwhile.
+    fn assert_written(&self, before: u64, began: Instant) {
+        let (written, time_s) = (self.direct.received() - before, began.elapsed().as_secs_f64());
+        assert!(written as f64 >= time_s * RATE_HZ / 4.0, "{written} samples written in {time_s:.2} s");
+    }
+
     /// Ends the flow. Asserts that the publisher was never blocked and that the received samples are sound.
     fn end(self) -> (Sent, Received) {
         let sent: Sent = self.publisher.end();
@@ -133,6 +145,7 @@ impl Flow {
         let received: Received = self.critical.end();
         received.assert_sound();
         self.slow.end::<Received>().assert_sound();
+        self.direct.end::<Received>().assert_sound();
         (sent, received)
     }
 }
@@ -186,9 +199,10 @@ fn a_killed_or_stopped_unit_is_restarted_and_delays_no_other() {
                 // over. Then the sample that it was sending may arrive twice.
                 std::thread::sleep(Duration::from_millis(1_500));
             }
-            let began = Instant::now();
+            let (began, before) = (Instant::now(), flow.direct.received());
             bed.machine.run(&["kill", "-s", signal, &bed.machine.main_pid(unit)]);
             bed.wait_restarts(unit, restarts);
+            flow.assert_written(before, began);
             let active = began.elapsed();
             flow.wait_critical(20);
             let critical = began.elapsed();
