@@ -1,4 +1,4 @@
-//! What the unit tests of ingress and the lanes share: a role with real shared memory.
+//! What the unit tests of ingress, the lanes and control share: a role with real shared memory.
 
 use std::time::{Duration, Instant};
 

@@ -11,7 +11,7 @@ const TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
 const QOS: QosProfile = QosProfile { durability: Durability::TransientLocal, ..QosProfile::CRITICAL };
 
 fn participant(name: &str) -> Participant {
-    let network = &DdsNetwork::of_domain(62);
+    let network = &DdsNetwork::of_domain(64);
     let (namespace, node_name) = ("/test".into(), name.into());
     Participant::open(&ParticipantOptions { network, namespace, node_name, graph_gid_bytes: 16, dscp: 0 })
         .unwrap()
@@ -37,17 +37,19 @@ fn polled(watch: &mut GraphWatch) -> u64 {
 
 #[test]
 fn a_poll_takes_a_limited_part_of_a_flood_of_graph_entries() {
-    let here = participant("here");
+    let mut here = participant("here");
+    let own = here.create_writer("rt/own", TYPE, &QOS, 1).unwrap();
     let mut watch = here.watch_graph().unwrap();
     let mut there = participant("there");
     let writer = there.create_writer("ros_discovery_info", TYPE, &QOS, 64).unwrap();
     support::wait_until("the reader of the graph", || {
         matches!(writer.poll_event(), Some(WriterEvent::Matched { joined: true, .. }))
     });
-    // The entries that the participants publish of themselves. That of another one may arrive later.
-    while watch.node_of(writer.guid()).is_none() {
+    // The entries that the participants publish of themselves would count among the 256: they come first.
+    support::wait_until("the entries of both participants", || {
         watch.poll();
-    }
+        watch.node_of(writer.guid()).is_some() && watch.node_of(own.guid()).is_some()
+    });
 
     write(&writer, 400, 100);
     assert_eq!([(); 3].map(|()| polled(&mut watch)), [256, 144, 0]);

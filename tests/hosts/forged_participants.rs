@@ -126,8 +126,7 @@ mod long {
         let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
         critical.wait_received(500);
         let pids = ROLES.map(|role| bed.pid(role));
-        let resident_kib = |pid| memory_kib(pid, "VmRSS");
-        let before = pids.map(resident_kib);
+        let before = pids.map(|pid| memory_kib(pid, "VmRSS"));
         let processes = bed.discovery_addresses();
 
         let (socket, stop) = (bed.host("slow").udp_socket(), Arc::new(AtomicBool::new(false)));
@@ -146,7 +145,8 @@ mod long {
         attack.join().unwrap();
 
         let status = bed.bridge.status();
-        let after = pids.map(resident_kib);
+        // The most that each has had.
+        let after = pids.map(|pid| memory_kib(pid, "VmHWM"));
         let [many, malformed, evicted] = [too_many, "malformed_datagram", "evicted_participant"]
             .map(|cause| ROLES.map(|role| refused(&status, role, cause)));
         let needs = MemoryNeeds::of(&config::parse(SCAN, "the test", &|_| None).unwrap());

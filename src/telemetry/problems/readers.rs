@@ -98,6 +98,7 @@ mod tests {
         ];
         assert_eq!(problems, expected);
     }
+
     #[test]
     fn late_joiners_without_the_history_are_a_problem_while_their_number_rises() {
         let problems = problems_after(|now| now.routes[0].outputs[0].counters.late_joiners_unserved = 3);

@@ -31,7 +31,7 @@ fn a_best_effort_late_joiner_waits_for_the_history_until_it_leaves() {
 
 #[test]
 fn a_late_joiner_for_which_no_place_is_free_is_counted() {
-    let mut host = Host::start(144, CRITICAL, YAML);
+    let mut host = Host::start(148, CRITICAL, YAML);
     host.announce_type();
     let mut output = host.open();
     let now = clock::monotonic();
