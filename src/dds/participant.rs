@@ -526,13 +526,9 @@ impl Participant {
         let mut changes = pin!(self.listener.as_async_status_stream());
         let mut context = Context::from_waker(&self.discovery_waker);
         while turn.takes_another() {
-            match changes.as_mut().poll_next(&mut context) {
-                Poll::Ready(Some(change)) => {
-                    if let Some(change) = translate(change) {
-                        return Some(change);
-                    }
-                }
-                Poll::Ready(None) | Poll::Pending => return None,
+            let Poll::Ready(Some(change)) = changes.as_mut().poll_next(&mut context) else { return None };
+            if let Some(change) = translate(change) {
+                return Some(change);
             }
         }
         None

@@ -126,8 +126,8 @@ impl Flow {
         self.critical.wait_received(self.critical.received() + samples);
     }
 
-    /// Asserts that the publisher has written at a quarter of its rate at least for the time since `began`, when
-    /// it had written `before` samples: one that waits for a stopped process writes none meanwhile.
+    /// Asserts that the publisher has written at a quarter of its rate at least since `began`, when it had
+    /// written `before` samples: one that waits for a stopped process writes none meanwhile.
     fn assert_written(&self, before: u64, began: Instant) {
         let (written, time_s) = (self.direct.received() - before, began.elapsed().as_secs_f64());
         assert!(written as f64 >= time_s * RATE_HZ / 4.0, "{written} samples written in {time_s:.2} s");
