@@ -33,8 +33,8 @@ use crate::policy::{HangWatch, hang_limit_ms, may_fence, take_overs_in_a_row};
 use crate::shm::{BoardWriter, Boards, ProcessRole, RoleLock, ShmError, root_of};
 use crate::telemetry::{Starvation, StatFile};
 
-/// How often a standby checks for a request to stop, and whether the role is free although no connection told
-/// it.
+/// How often, to within [`STOPPED_POLL_MS`], a standby checks for a request to stop, and whether the role is
+/// free although no connection told it.
 const POLL_MS: u16 = 50;
 
 /// How often a standby checks whether the active process is stopped.
