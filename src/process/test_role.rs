@@ -11,14 +11,15 @@ use crate::shm::ProcessRole;
 pub const TYPE: &str = "std_msgs::msg::dds_::UInt8MultiArray_";
 pub const SCAN: &str = "topics: [{id: scan, input_topic: /scan}]";
 
-/// Opens a role with the topics and lanes of `yaml`, and returns it with its settings and its folder. Each
-/// test has a domain of its own, because they run at the same time.
+/// Opens a role with the topics and lanes of `yaml`, and returns it after its folder, which is dropped last
+/// then: the role removes its files in shared memory by what is there. Each test has a domain of its own,
+/// because they run at the same time.
 pub fn open(
     process: ProcessRole,
     name: &'static str,
     domain_id: u16,
     yaml: &str,
-) -> (Role, Settings, tempfile::TempDir) {
+) -> (tempfile::TempDir, Role, Settings) {
     let folder = tempfile::tempdir().unwrap();
     let text = format!(
         "instance: {name}_{}_{domain_id}\nros: {{domain_id: {domain_id}}}\n\
@@ -32,7 +33,7 @@ pub fn open(
     let reloads = ReloadRequests::on_signal(move |_| Ok(read.clone().into())).unwrap();
     let place = Place::take(&settings, reloads, name, &Scheduling::default()).unwrap();
     let role = Role::open(place, process);
-    (role, settings, folder)
+    (folder, role, settings)
 }
 
 pub fn wait_until(what: &str, mut fulfilled: impl FnMut() -> bool) {

@@ -425,7 +425,7 @@ mod tests {
     #[test]
     fn an_override_of_a_responder_that_is_not_listed_outlasts_its_silence() {
         let yaml = format!("{SCAN}\nclassifier: {{enabled: true}}");
-        let (role, settings, _folder) = test_role::open(ProcessRole::Control, "control", 149, &yaml);
+        let (_folder, role, settings) = test_role::open(ProcessRole::Control, "control", 149, &yaml);
         let options = participant_options(&settings, &settings.lanes[0].network, "control");
         let mut participant = Participant::open(&options).unwrap();
         let links = vec![0; settings.lanes.len()];

@@ -71,7 +71,7 @@ mod tests {
 
     #[test]
     fn a_reader_is_that_of_the_former_process_if_it_requests_the_same_and_has_said_no_goodbye() {
-        let (role, ..) = test_role::open(ProcessRole::Ingress, "ingress", 74, SCAN);
+        let (_folder, role, ..) = test_role::open(ProcessRole::Ingress, "ingress", 74, SCAN);
         let (ours, others) = (Guid([1; 16]), Guid([2; 16]));
         let dds_type = DdsType { name: TYPE, hash: TypeHash::UNKNOWN, has_keys: false };
         let qos = |depth| ReaderQos {

@@ -35,7 +35,7 @@ struct Host {
 
 impl Host {
     fn start(domain_id: u16, lane: usize, yaml: &str) -> Self {
-        let (role, settings, folder) = test_role::open(ProcessRole::Egress(lane), "egress", domain_id, yaml);
+        let (folder, role, settings) = test_role::open(ProcessRole::Egress(lane), "egress", domain_id, yaml);
         let options = participant_options(&settings, &settings.lanes[lane].network, "egress");
         let participant = Participant::open(&options).unwrap();
         let publisher = SamplePublisher::create(&role.node, &RouteChannel::of(&settings, 0)).unwrap();

@@ -23,7 +23,7 @@ fn record(role: &Role) -> WriterRecord {
 
 #[test]
 fn a_writer_continues_the_numbers_of_the_former_process_if_it_is_the_same_writer() {
-    let (role, ..) = test_role::open(ProcessRole::Egress(LANE), "egress", 71, SCAN);
+    let (_folder, role, ..) = test_role::open(ProcessRole::Egress(LANE), "egress", 71, SCAN);
     let (ours, others) = (Guid([1; 16]), Guid([2; 16]));
     let (qos, other_qos) =
         (QosProfile::CRITICAL, QosProfile { deadline_ms: Some(5), ..QosProfile::CRITICAL });
@@ -73,7 +73,7 @@ fn a_writer_continues_the_numbers_of_the_former_process_if_it_is_the_same_writer
 
 #[test]
 fn readers_are_told_of_a_writer_that_is_not_continued() {
-    let (role, settings, _folder) = test_role::open(ProcessRole::Egress(LANE), "egress", 75, SCAN);
+    let (_folder, role, settings) = test_role::open(ProcessRole::Egress(LANE), "egress", 75, SCAN);
     let ours = Guid([1; 16]);
     let next = |mut record: WriterRecord, qos| record.next(ours, "rt/a", &DDS_TYPE, qos);
     let (qos, other) = (QosProfile::CRITICAL, QosProfile { deadline_ms: Some(5), ..QosProfile::CRITICAL });
@@ -101,7 +101,7 @@ fn readers_are_told_of_a_writer_that_is_not_continued() {
 
 #[test]
 fn the_log_has_the_last_samples_that_were_written() {
-    let (role, ..) = test_role::open(ProcessRole::Egress(LANE), "egress", 73, SCAN);
+    let (_folder, role, ..) = test_role::open(ProcessRole::Egress(LANE), "egress", 73, SCAN);
     let log = role.boards.send_log(LANE, 0);
     let mut process = record(&role);
     let writer = process.next(Guid([1; 16]), "rt/a", &DDS_TYPE, &QosProfile::CRITICAL).continuation;
@@ -132,7 +132,7 @@ fn keys_are_those_of_no_other_writer() {
 
 #[test]
 fn a_noncritical_lane_keeps_no_identity() {
-    let (mut role, settings, _folder) = test_role::open(ProcessRole::Egress(1), "egress", 72, SCAN);
+    let (_folder, mut role, settings) = test_role::open(ProcessRole::Egress(1), "egress", 72, SCAN);
     let options = participant_options(&settings, &settings.lanes[1].network, "egress");
     let (participant, identity) =
         join(&mut role, &settings.lanes[1], ProcessRole::Egress(1), "egress-noncritical", &options).unwrap();

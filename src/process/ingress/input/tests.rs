@@ -27,7 +27,7 @@ struct Host {
 
 impl Host {
     fn start(domain_id: u16, yaml: &str) -> Self {
-        let (role, settings, folder) = test_role::open(ProcessRole::Ingress, "ingress", domain_id, yaml);
+        let (folder, role, settings) = test_role::open(ProcessRole::Ingress, "ingress", domain_id, yaml);
         let participant =
             Participant::open(&participant_options(&settings, &settings.input, "ingress")).unwrap();
         Self { participant, role, settings, _folder: folder }
