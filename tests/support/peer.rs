@@ -214,6 +214,11 @@ impl Peer {
         self.option("--max-samples", samples)
     }
 
+    /// How long a write waits for room in the history, 0.1 s by default.
+    pub fn max_blocking_s(self, seconds: u32) -> Peer {
+        self.option("--max-blocking-ms", 1_000 * seconds)
+    }
+
     /// Sets the samples per second; 0 is as fast as possible.
     pub fn rate_hz(self, rate_hz: f64) -> Peer {
         self.option("--rate", rate_hz)
