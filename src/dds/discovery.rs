@@ -10,7 +10,7 @@ const MAX_ADDRESSES: usize = 64;
 
 /// The most changes that wait for [`Participant::poll_discovery`](super::Participant::poll_discovery): those
 /// beyond are lost.
-pub const MAX_WAITING_CHANGES: usize = 2_048;
+pub(super) const MAX_WAITING_CHANGES: usize = 2_048;
 
 /// The changes of discovery that the caller still takes before it does its other work: as many as can wait. A
 /// peer that announces and withdraws endpoints as fast as it can keeps no caller in a loop.
@@ -20,11 +20,6 @@ pub struct DiscoveryTurn {
 }
 
 impl DiscoveryTurn {
-    /// A turn that takes up to [`MAX_WAITING_CHANGES`].
-    pub const fn new() -> Self {
-        Self { left: MAX_WAITING_CHANGES }
-    }
-
     /// Whether the turn takes another change, also one that the bridge does not look at, which then counts.
     pub(super) const fn takes_another(&mut self) -> bool {
         let takes_another = self.left > 0;
@@ -35,7 +30,7 @@ impl DiscoveryTurn {
 
 impl Default for DiscoveryTurn {
     fn default() -> Self {
-        Self::new()
+        Self { left: MAX_WAITING_CHANGES }
     }
 }
 
@@ -131,7 +126,7 @@ mod tests {
 
     #[test]
     fn a_turn_takes_as_many_changes_as_can_wait() {
-        let mut turn = DiscoveryTurn::new();
+        let mut turn = DiscoveryTurn::default();
         let taken = (0..10_000).filter(|_| turn.takes_another()).count();
         assert_eq!(taken, MAX_WAITING_CHANGES);
     }

@@ -57,7 +57,7 @@ pub fn history_bytes(qos: &QosProfile, window_samples: usize, max_sample_bytes: 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dds::MAX_WAITING_CHANGES;
+    use crate::dds::discovery::MAX_WAITING_CHANGES;
     use crate::model::History;
 
     #[test]

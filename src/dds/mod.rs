@@ -19,7 +19,7 @@ mod reader;
 mod writer;
 
 pub use arrivals::{Arrival, Arrivals, ArrivalsCloser};
-pub use discovery::{Discovery, DiscoveryTurn, Endpoint, MAX_WAITING_CHANGES};
+pub use discovery::{Discovery, DiscoveryTurn, Endpoint};
 pub use error::DdsError;
 pub use graph::{GraphEntry, GraphNode, decode_graph, encode_graph};
 pub use graph_watch::{GraphRefusals, GraphWatch, MAX_GRAPH_ENDPOINTS, MAX_PARTICIPANTS};

@@ -308,12 +308,7 @@ impl Host {
 
 /// The open UDP ports in the network namespace of a process.
 pub fn udp_ports(pid: i32) -> Vec<u16> {
-    let table = fs::read_to_string(format!("/proc/{pid}/net/udp")).unwrap();
-    let mut ports: Vec<u16> = table
-        .lines()
-        .skip(1)
-        .filter_map(|line| u16::from_str_radix(line.split_whitespace().nth(1)?.rsplit(':').next()?, 16).ok())
-        .collect();
+    let mut ports: Vec<u16> = udp_sockets(pid).into_iter().map(|(port, _)| port).collect();
     ports.sort_unstable();
     ports.dedup();
     ports
@@ -322,14 +317,18 @@ pub fn udp_ports(pid: i32) -> Vec<u16> {
 /// The UDP ports of the sockets of one process.
 pub fn udp_ports_of(pid: i32) -> Vec<u16> {
     let files = fs::read_dir(format!("/proc/{pid}/fd")).unwrap().flatten();
-    let targets: Vec<_> = files.filter_map(|file| fs::read_link(file.path()).ok()).collect();
-    let is_own =
-        |inode: &str| targets.iter().any(|target| target.as_os_str() == &*format!("socket:[{inode}]"));
-    let table = fs::read_to_string(format!("/proc/{pid}/net/udp")).unwrap();
-    let port = |line: &str| {
+    let own: Vec<_> = files.filter_map(|file| fs::read_link(file.path()).ok()).collect();
+    let is_own = |inode: &str| own.iter().any(|target| target.as_os_str() == &*format!("socket:[{inode}]"));
+    udp_sockets(pid).into_iter().filter(|(_, inode)| is_own(inode)).map(|(port, _)| port).collect()
+}
+
+/// The port and the inode of each UDP socket in the network namespace of a process.
+fn udp_sockets(pid: i32) -> Vec<(u16, String)> {
+    let socket = |line: &str| {
         let mut fields = line.split_whitespace();
-        let port = fields.nth(1)?.rsplit(':').next()?;
-        is_own(fields.nth(7)?).then(|| u16::from_str_radix(port, 16).ok())?
+        let port = u16::from_str_radix(fields.nth(1)?.rsplit(':').next()?, 16).ok()?;
+        Some((port, fields.nth(7)?.to_owned()))
     };
-    table.lines().skip(1).filter_map(port).collect()
+    let table = fs::read_to_string(format!("/proc/{pid}/net/udp")).unwrap();
+    table.lines().skip(1).filter_map(socket).collect()
 }

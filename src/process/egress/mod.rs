@@ -190,28 +190,18 @@ impl Egress {
     fn open(settings: &Settings, index: usize, place: Place, role_name: &str) -> Result<Self, RoleError> {
         let lane = &settings.lanes[index];
         let process = ProcessRole::Egress(index);
-        let mut role = Role::open(place, process);
+        let role = Role::open(place, process);
         memory_limit::check(settings, process);
         let node = format!("egress_{}", lane.name);
         let options =
             ParticipantOptions { dscp: lane.dscp, ..participant_options(settings, &lane.network, &node) };
-        // Each takes some 5 ms, which is a fourth of the pause when a standby takes over.
-        let node = role.node.clone();
-        let (queues, joined) = std::thread::scope(|scope| {
-            let queue = |output: &config::Output| Output::open_queue(&node, settings, lane, output.route);
-            let queues = scope.spawn(move || lane.outputs.iter().map(queue).collect::<Result<Vec<_>, _>>());
-            let joined = join(&mut role, lane, process, role_name, &options);
-            (queues.join(), joined)
-        });
-        let queues = match queues.unwrap_or_else(|panic| std::panic::resume_unwind(panic)) {
-            Ok(queues) => queues,
-            Err(error) => {
-                // As if the process were killed, so that the next process can continue it.
-                std::mem::forget((joined, role));
-                return Err(error.into());
-            }
-        };
-        let (mut participant, identity) = joined?;
+        let (role, queues, (mut participant, identity)) = role.open_beside(
+            |node, _| {
+                let queue = |output: &config::Output| Output::open_queue(node, settings, lane, output.route);
+                lane.outputs.iter().map(queue).collect::<Result<Vec<_>, _>>()
+            },
+            |role| join(role, lane, process, role_name, &options),
+        )?;
         let mut outputs = Vec::with_capacity(lane.outputs.len());
         let mut more_urgent = Vec::with_capacity(lane.outputs.len());
         let priority = |output: &config::Output| settings.routes[output.route].priority;
@@ -356,7 +346,7 @@ impl Egress {
     fn housekeeping(&mut self, now: MonotonicNs) {
         let mut gone = Vec::new();
         let mut discovery_changed = false;
-        let mut turn = DiscoveryTurn::new();
+        let mut turn = DiscoveryTurn::default();
         while let Some(change) = self.participant.poll_discovery(&mut turn) {
             discovery_changed = true;
             if matches!(change, Discovery::ReaderGone(_) | Discovery::ParticipantGone { .. }) {

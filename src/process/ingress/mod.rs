@@ -137,7 +137,7 @@ impl Drop for Ingress {
 
 impl Ingress {
     fn open(settings: &Settings, place: Place) -> Result<Self, RoleError> {
-        let mut role = Role::open(place, ProcessRole::Ingress);
+        let role = Role::open(place, ProcessRole::Ingress);
         memory_limit::check(settings, ProcessRole::Ingress);
         let urgent: Vec<_> = urgent_routes(settings).collect();
         let shared = Arc::default();
@@ -153,24 +153,11 @@ impl Ingress {
             let (on_arriving, on_received) = Receiving::hooks(&shared);
             Participant::open_receiving(&options, kept, unfinished, urgent_topics(), on_arriving, on_received)
         };
-        let (node, boards) = (role.node.clone(), role.boards.clone());
         let standby = settings.ingress_standby;
-        // The pools beside the participant: either takes some 8 ms, for which a take-over waits.
-        let (pools, joined) = std::thread::scope(|scope| {
-            let pools = scope.spawn(|| open_pools(&node, &boards, settings));
-            let joined = Identity::join(&mut role, ProcessRole::Ingress, NAME, &options, standby, open);
-            (pools.join(), joined)
-        });
-        let pools = match pools.unwrap_or_else(|panic| std::panic::resume_unwind(panic)) {
-            Ok(pools) => pools,
-            Err(error) => {
-                // As if the process were killed: dropped, the participant would say goodbye, and the role
-                // would record a regular end. After either, the next process could not continue it.
-                std::mem::forget((joined, role));
-                return Err(error.into());
-            }
-        };
-        let (participant, identity, continued) = joined?;
+        let (role, pools, (participant, identity, continued)) = role.open_beside(
+            |node, boards| open_pools(node, boards, settings),
+            |role| Identity::join(role, ProcessRole::Ingress, NAME, &options, standby, open),
+        )?;
         let mut inputs = Vec::with_capacity(settings.routes.len());
         for (route, pool) in pools.into_iter().enumerate() {
             let flag = ArrivalFlag::passive();
@@ -218,7 +205,7 @@ impl Ingress {
 
     fn housekeeping(&mut self, now: MonotonicNs) -> Result<(), RoleError> {
         let mut discovery_changed = false;
-        let mut turn = DiscoveryTurn::new();
+        let mut turn = DiscoveryTurn::default();
         while let Some(change) = self.participant.poll_discovery(&mut turn) {
             discovery_changed = true;
             match change {

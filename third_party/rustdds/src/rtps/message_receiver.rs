@@ -1348,10 +1348,8 @@ mod tests {
   // them have numbers of the same writer.
   #[test]
   fn a_best_effort_reader_tracks_few_samples_of_a_writer_with_gaps() {
-    let writer =
-      EntityId::create_custom_entity_id([0, 0, 9], EntityKind::WRITER_NO_KEY_USER_DEFINED);
     let prefix = GuidPrefix::new(&[2; 12]);
-    let source = GUID::new_with_prefix_and_id(prefix, writer);
+    let source = GUID::new_with_prefix_and_id(prefix, WRITER);
     let mut reader = best_effort_reader(user_reader(1), "topic", source);
     let mr_state = MessageReceiverState {
       source_guid_prefix: prefix,
@@ -1359,7 +1357,7 @@ mod tests {
     };
     for number in 1..=1_000 {
       let data = Data {
-        writer_id: writer,
+        writer_id: WRITER,
         writer_sn: SequenceNumber::new(2 * number),
         ..Data::default()
       };
