@@ -6,6 +6,8 @@
 mod answers;
 mod messages;
 mod setting;
+#[cfg(test)]
+mod tests;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -26,7 +28,8 @@ use crate::clock;
 use crate::config::{SetParameters, Settings};
 use crate::dds::{Inbox, Participant, Payload, RawReader, RawWriter, ReaderQos, SampleOrigin, TakePayload};
 use crate::model::{
-    Durability, Encapsulation, Guid, History, MonotonicNs, ParameterRequests, QosProfile, Reliability,
+    Durability, Encapsulation, Guid, History, MonotonicNs, ParameterRequests, QosProfile, ReaderRecord,
+    Reliability,
 };
 use crate::policy::SenderLimits;
 use crate::shm::root_of;
@@ -72,13 +75,17 @@ const READERS_AT_ONCE: usize = WINDOW_SAMPLES;
 
 /// How long a reply is kept for readers of its client's participant: a request may arrive before discovery
 /// has found the reader of the client, while that of another client is there already, and DDS delivers no
-/// earlier sample to a VOLATILE reader.
+/// earlier sample to a VOLATILE reader. It is also how long a reply waits at most for room in the history.
 const MATCH_MS: u64 = 1_000;
+
+/// How long a reply that has not been acknowledged holds up those to other participants. Acknowledgements
+/// take milliseconds, and a client that is gone sends none.
+const OTHERS_MS: u64 = 100;
 
 /// Interval at which the thread checks for new readers of the replies that it keeps.
 const LOOK: Duration = Duration::from_millis(10);
 
-/// Replies that are kept for further readers at the same time.
+/// Replies that wait for room or for further readers at the same time.
 const MAX_WAITING_REPLIES: usize = 32;
 
 /// How long the answer to a request that sets parameters waits until all processes have applied them. Each
@@ -185,7 +192,12 @@ impl ParameterServices {
             Services {
                 // Here, because arrivals wake the thread that creates an inbox.
                 servers: servers
-                    .map(|(service, reader, writer)| Server { service, inbox: Inbox::new(reader), writer })
+                    .map(|(service, reader, writer)| Server {
+                        service,
+                        inbox: Inbox::new(reader),
+                        writer,
+                        sent: SentReplies::default(),
+                    })
                     .collect(),
                 parameters: Parameters::new(settings),
                 setter: Setter::new(store),
@@ -258,6 +270,7 @@ struct Server {
     service: Service,
     inbox: Inbox,
     writer: RawWriter,
+    sent: SentReplies,
 }
 
 /// A request with its origin.
@@ -267,7 +280,38 @@ struct Request<'a> {
     encapsulation: Encapsulation,
 }
 
-/// A reply that waits for readers that are not discovered yet.
+/// The last replies of a service: those that the writer's history has.
+#[derive(Default)]
+struct SentReplies(VecDeque<SentReply>);
+
+struct SentReply {
+    reader: Guid,
+    /// The samples that the reader had been offered with it.
+    offered: u64,
+    at: MonotonicNs,
+}
+
+impl SentReplies {
+    /// Whether a reply to this reader evicts none that another one, or this one, may still request again.
+    fn has_room(&self, reader: &Guid, readers: &[ReaderRecord], now: MonotonicNs) -> bool {
+        let is_needed = |sent: &&SentReply| {
+            let lacks = |record: &ReaderRecord| record.offered - record.unacknowledged < sent.offered;
+            let is_acknowledged = !readers.iter().any(|record| record.reader == sent.reader && lacks(record));
+            let is_own = sent.reader.prefix() == reader.prefix();
+            !is_acknowledged && (is_own || now < sent.at.plus_ms(OTHERS_MS))
+        };
+        self.0.iter().filter(is_needed).count() < WINDOW_SAMPLES
+    }
+
+    fn add(&mut self, reply: SentReply) {
+        if self.0.len() == WINDOW_SAMPLES {
+            self.0.pop_front();
+        }
+        self.0.push_back(reply);
+    }
+}
+
+/// A reply that waits for room in the history, or for readers that are not discovered yet.
 struct WaitingReply {
     server: usize,
     request: SampleOrigin,
@@ -275,6 +319,13 @@ struct WaitingReply {
     until: MonotonicNs,
     /// The readers that it was sent to.
     sent: Vec<Guid>,
+}
+
+/// Whether the history must have room for a reply that a reader has not acknowledged.
+#[derive(Clone, Copy)]
+enum Room {
+    Needed,
+    NotNeeded,
 }
 
 struct Services {
@@ -337,7 +388,7 @@ impl Services {
             Some(payload) => {
                 let until = clock::monotonic().plus_ms(MATCH_MS);
                 let mut reply = WaitingReply { server, request: origin, payload, until, sent: Vec::new() };
-                self.send(&mut reply);
+                self.send(&mut reply, Room::Needed);
                 if self.waiting.len() == MAX_WAITING_REPLIES {
                     self.forget_one();
                 }
@@ -414,15 +465,24 @@ impl Services {
         }
     }
 
-    /// Discards a kept reply to make room: the oldest that was sent to a reader, else the oldest.
+    /// Discards a kept reply to make room: the oldest that was sent to a reader, else the oldest to which a
+    /// reader has been discovered, else the oldest.
     fn forget_one(&mut self) {
         let sent = self.waiting.iter().position(|reply| !reply.sent.is_empty());
-        if let Some(reply) = self.waiting.remove(sent.unwrap_or(0)) {
-            self.forget(&reply);
+        let known = || {
+            let readers = |reply: &WaitingReply| self.servers[reply.server].writer.matched_readers();
+            self.waiting.iter().position(|reply| readers(reply).any(|record| reply.is_to(&record.reader)))
+        };
+        if let Some(reply) = self.waiting.remove(sent.or_else(known).unwrap_or(0)) {
+            self.forget(reply);
         }
     }
 
-    fn forget(&self, reply: &WaitingReply) {
+    /// Sends a reply that has waited for room in vain, rather than never.
+    fn forget(&mut self, mut reply: WaitingReply) {
+        if reply.sent.is_empty() {
+            self.send(&mut reply, Room::NotNeeded);
+        }
         if reply.sent.is_empty() {
             add(&self.counts.no_client);
         }
@@ -432,33 +492,47 @@ impl Services {
         let now = clock::monotonic();
         for _ in 0..self.waiting.len() {
             let Some(mut reply) = self.waiting.pop_front() else { return };
-            self.send(&mut reply);
+            self.send(&mut reply, Room::Needed);
             if now < reply.until {
                 self.waiting.push_back(reply);
             } else {
-                self.forget(&reply);
+                self.forget(reply);
             }
         }
     }
 
     /// Sends a reply once to each reader of the client's participant, the one that was created next to the
     /// client's writer first. Those of other participants do not receive it: they could not decode the form
-    /// of another library.
-    fn send(&self, reply: &mut WaitingReply) {
-        let (request, writer) = (&reply.request, &self.servers[reply.server].writer);
+    /// of another library. If room is needed, those for which the history has none get it later.
+    fn send(&mut self, reply: &mut WaitingReply, room: Room) {
+        let Server { writer, sent, .. } = &mut self.servers[reply.server];
+        let now = clock::monotonic();
         let readers = writer.matched_readers().map(|record| record.reader);
-        let own = readers.filter(|reader| reader.prefix() == request.writer.prefix());
-        let mut new: Vec<Guid> = own.filter(|reader| !reply.sent.contains(reader)).collect();
-        new.sort_by_key(|reader| number(reader).abs_diff(number(&request.writer)));
+        let mut new: Vec<Guid> =
+            readers.filter(|reader| reply.is_to(reader) && !reply.sent.contains(reader)).collect();
+        new.sort_by_key(|reader| number(reader).abs_diff(number(&reply.request.writer)));
         for reader in new.into_iter().take(READERS_AT_ONCE.min(MAX_READERS - reply.sent.len())) {
-            if let Err(error) = writer.write_reply(reader, request, reply.payload.clone()) {
+            let readers: Vec<ReaderRecord> = writer.matched_readers().collect();
+            if matches!(room, Room::Needed) && !sent.has_room(&reader, &readers, now) {
+                return;
+            }
+            if let Err(error) = writer.write_reply(reader, &reply.request, reply.payload.clone()) {
                 debug!(%error, "cannot send a reply");
             }
+            let offered = writer.matched_readers().find(|record| record.reader == reader);
+            sent.add(SentReply { reader, offered: offered.map_or(0, |record| record.offered), at: now });
             if reply.sent.is_empty() {
                 add(&self.counts.answered);
             }
             reply.sent.push(reader);
         }
+    }
+}
+
+impl WaitingReply {
+    /// Whether the reader is one of the client's participant.
+    fn is_to(&self, reader: &Guid) -> bool {
+        reader.prefix() == self.request.writer.prefix()
     }
 }
 
