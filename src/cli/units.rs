@@ -315,6 +315,7 @@ mod tests {
         );
         for (unit, text) in &drop_ins.0 {
             assert!(without_memory(text).is_empty() && text.contains("\nMemoryMax="), "{unit}: {text}");
+            assert_eq!(text.contains("\nMemoryHigh="), unit == NONCRITICAL_SLICE, "{unit}: {text}");
         }
         assert!(drop_ins.match_folder(Path::new("/nonexistent")));
     }

@@ -126,3 +126,26 @@ fn systemd_keeps_the_sockets_of_ingress_and_the_critical_lane() {
     assert!(CRITICAL.into_iter().all(keeps));
     assert!(!OTHERS.into_iter().any(keeps));
 }
+
+#[test]
+fn each_service_has_a_watchdog_and_is_in_the_slice_of_its_kind() {
+    for unit in CRITICAL.into_iter().chain(OTHERS).filter(|unit| *unit != COMMON) {
+        let settings = settings(unit);
+        let of = |name: &str| settings.iter().find_map(|line| line.strip_prefix(name));
+        let (slice, watchdog) = match unit {
+            _ if CRITICAL.contains(&unit) => (Some("adaptive-bridge-critical.slice"), "2s"),
+            "adaptive-bridge-egress@.service" => (Some("adaptive-bridge-noncritical.slice"), "5s"),
+            "adaptive-bridge-control.service" => (Some("adaptive-bridge.slice"), "5s"),
+            // It runs on another computer.
+            _ => (None, "5s"),
+        };
+        assert_eq!((of("Slice="), of("WatchdogSec=")), (slice, Some(watchdog)), "{unit}");
+    }
+    let limits = settings("adaptive-bridge-noncritical.slice");
+    for limit in ["CPUQuota=100%", "TasksMax=1024"] {
+        assert!(limits.contains(limit), "{limit} in {limits:?}");
+    }
+    let others = ["adaptive-bridge.slice", "adaptive-bridge-critical.slice"].map(settings);
+    let is_limit = |line: &&String| ["CPUQuota", "Memory", "Tasks"].iter().any(|name| line.starts_with(name));
+    assert_eq!(others.iter().flatten().find(is_limit), None);
+}
