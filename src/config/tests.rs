@@ -192,8 +192,8 @@ fn rates_come_from_lane_then_mode_then_routing_policy() {
          \x20 noncritical_drop_policy: drop_latest\n\
          \x20 stale_threshold_ms: 900\n\
          \x20 modes:\n\
-         \x20   normal: {noncritical_depth: 30, max_noncritical_queue: 12}\n\
-         \x20   degraded: {stale_threshold_ms: 100, noncritical_depth: 0, \
+         \x20   normal: {noncritical_max_rate_hz: 25, noncritical_depth: 30, max_noncritical_queue: 12}\n\
+         \x20   degraded: {noncritical_max_rate_hz: 4, stale_threshold_ms: 100, noncritical_depth: 0, \
          noncritical_drop_policy: drop_stale}\n\
          safety: {max_noncritical_queue: 6}\n\
          lanes:\n\
@@ -209,11 +209,11 @@ fn rates_come_from_lane_then_mode_then_routing_policy() {
         queue_samples,
     };
     let rates = |name: &str| rates(lane(&settings, name));
-    assert_eq!(rates("noncritical").normal, policy(20.0, None, 900, DropPolicy::DropLatest, 12));
-    assert_eq!(rates("noncritical").degraded, policy(3.0, None, 100, DropPolicy::DropStale, 1));
+    assert_eq!(rates("noncritical").normal, policy(25.0, None, 900, DropPolicy::DropLatest, 12));
+    assert_eq!(rates("noncritical").degraded, policy(4.0, None, 100, DropPolicy::DropStale, 1));
     assert_eq!(rates("slow").normal, policy(2.0, Some(1000), 0, DropPolicy::DropLatest, 9));
-    assert_eq!(rates("slow").degraded, policy(2.0, Some(1000), 100, DropPolicy::DropStale, 9));
-    assert_eq!(rates("fast").normal, policy(20.0, None, 900, DropPolicy::DropOldest, 12));
+    assert_eq!(rates("slow").degraded, policy(4.0, Some(1000), 100, DropPolicy::DropStale, 9));
+    assert_eq!(rates("fast").normal, policy(25.0, None, 900, DropPolicy::DropOldest, 12));
     assert_eq!(rates("fast").degraded, policy(15.0, Some(10), 3, DropPolicy::DropOldest, 1));
 }
 

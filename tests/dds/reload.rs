@@ -134,6 +134,12 @@ fn rates_and_staleness_change_under_flow_and_no_sample_is_lost() {
     let (code, output) = reload(&bridge);
     assert_eq!(code, Some(0), "{output}");
     assert_says(&output, &["): nothing differs\n"]);
+
+    // The samples have 8 bytes, so that 320 bytes/s are 40 Hz.
+    bridge.write_config(&file(110, "lanes: {noncritical: {max_rate_hz: 100, max_bytes_per_s: 320}}"));
+    let (code, output) = reload(&bridge);
+    assert_eq!(code, Some(0), "{output}");
+    wait_rate(&bridge, 40.0);
     flow.end_whole(&bridge);
 }
 

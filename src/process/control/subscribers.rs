@@ -380,8 +380,9 @@ mod tests {
     use super::super::super::probes::Trust;
     use super::*;
     use crate::dds::Participant;
+    use crate::model::SubscriberWarning;
     use crate::policy::FORGET_UNLISTED_MS;
-    use crate::process::role::participant_options;
+    use crate::process::role::{Role, participant_options};
     use crate::process::test_role::{self, SCAN};
     use crate::shm::ProcessRole;
 
@@ -397,6 +398,16 @@ mod tests {
     }
 
     impl Bench {
+        fn new(role: &Role, settings: &Settings, participant: &mut Participant) -> Self {
+            let now = MonotonicNs(1_000_000_000_000);
+            Self {
+                subscribers: Subscribers::new(&role.boards, settings, &vec![0; settings.lanes.len()], now),
+                link: Link::open(participant, settings).unwrap(),
+                trust: super::super::load_trust(settings, None).unwrap(),
+                now,
+            }
+        }
+
         /// Probes and evaluates for some time. The `responders` answer each probe after 5 ms. After each
         /// evaluation, `see` gets the known subscribers.
         fn run(&mut self, settings: &Settings, ms: u64, responders: &[&str], see: impl Fn(&[Subscriber])) {
@@ -423,6 +434,24 @@ mod tests {
     }
 
     #[test]
+    fn each_warning_has_the_threshold_of_its_figure() {
+        let (_folder, role, mut settings) = test_role::open(ProcessRole::Control, "control", 163, SCAN);
+        let options = participant_options(&settings, &settings.lanes[0].network, "control");
+        let mut participant = Participant::open(&options).unwrap();
+        for warning in SubscriberWarning::ALL {
+            // Every figure is above -1, and none is above 1,000.
+            let of = |figure| if figure == warning { -1.0 } else { 1_000.0 };
+            settings.probes.rtt_threshold_ms = of(SubscriberWarning::Rtt);
+            settings.probes.loss_threshold = of(SubscriberWarning::Loss);
+            settings.probes.jitter_threshold_ms = of(SubscriberWarning::Jitter);
+            let mut bench = Bench::new(&role, &settings, &mut participant);
+            bench.run(&settings, 20_000, &["laptop"], |_| ());
+            let shown: Vec<u8> = bench.subscribers.list.iter().map(|one| one.warning_bits).collect();
+            assert_eq!(shown, [warning as u8]);
+        }
+    }
+
+    #[test]
     fn an_override_of_a_responder_that_is_not_listed_outlasts_its_silence() {
         let yaml = format!("{SCAN}\nclassifier: {{enabled: true}}");
         let (_folder, role, settings) = test_role::open(ProcessRole::Control, "control", 149, &yaml);
@@ -430,13 +459,7 @@ mod tests {
         let mut participant = Participant::open(&options).unwrap();
         let links = vec![0; settings.lanes.len()];
         for forced in [SubscriberState::Critical, SubscriberState::Noncritical] {
-            let now = MonotonicNs(1_000_000_000_000);
-            let mut bench = Bench {
-                subscribers: Subscribers::new(&role.boards, &settings, &links, now),
-                link: Link::open(&mut participant, &settings).unwrap(),
-                trust: super::super::load_trust(&settings, None).unwrap(),
-                now,
-            };
+            let mut bench = Bench::new(&role, &settings, &mut participant);
             bench.run(&settings, 20_000, &["laptop", "tablet"], |_| ());
             assert_eq!(bench.ids(), ["laptop", "tablet"]);
             let state =
