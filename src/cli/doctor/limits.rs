@@ -253,9 +253,11 @@ mod tests {
     fn limits_and_clocks_are_judged() {
         assert_eq!(open_files(1024).severity, Severity::Ok);
         assert_eq!(open_files(256).severity, Severity::Warning);
+        assert!(open_files(256).command.unwrap().contains("ulimit -n 1024"));
         assert_eq!(throttling(950_000).severity, Severity::Ok);
         assert_eq!(throttling(-1).severity, Severity::Note);
         assert_eq!(throttling(0).severity, Severity::Warning);
+        assert!(throttling(0).command.unwrap().contains("sched_rt_runtime_us=950000"));
         assert_eq!(clock_source("tsc", "tsc hpet").severity, Severity::Ok);
         assert!(clock_source("hpet", "tsc hpet").command.unwrap().contains("echo tsc"));
         assert_eq!(clock_source("acpi_pm", "hpet acpi_pm").severity, Severity::Note);
