@@ -1,5 +1,6 @@
 //! The command line from outside, on bridges that really run: the shipped binary as child processes, real
-//! shared memory, and publishers and subscribers of this process on real sockets. Domains 100 to 109 and 120.
+//! shared memory, and publishers and subscribers of this process on real sockets. Domains 100 to 109, 120
+//! and 124.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -21,6 +22,7 @@ use bytes::Bytes;
 use nix::sys::signal::Signal;
 use serde_json::Value;
 use support::bridge::{Bridge, program};
+use support::flow::Flow;
 use support::process::Process;
 use support::{wait_for, wait_until};
 
@@ -522,7 +524,10 @@ fn a_tap_receives_payloads_bit_for_bit_and_disturbs_no_lane() {
     );
     assert_eq!((words[12], words[13], words[14]), ("window", "300", "lost"), "{hz}");
     let figure = |at: usize| words[at].parse::<f64>().unwrap();
-    assert!(figure(1) > 0.0 && figure(4) <= figure(7), "{hz}");
+    assert!(figure(4) <= figure(7), "{hz}");
+    // The intervals, in ms, have this rate in the mean.
+    let between = 1_000.0 / figure(7)..=1_000.0 / figure(4);
+    assert!(between.contains(&figure(1)) && figure(1) < 300.0, "{hz}");
 
     let status = status(&bridge);
     assert_eq!(status["routes"][0]["whole"], true);
@@ -533,6 +538,22 @@ fn a_tap_receives_payloads_bit_for_bit_and_disturbs_no_lane() {
     // There was no subscriber except the tap.
     let others = drops.iter().filter(|(reason, _)| *reason != "no_reader");
     assert!(others.into_iter().all(|(_, count)| *count == 0), "{drops:?}");
+}
+
+#[test]
+fn taps_that_read_stop_and_die_cost_a_subscriber_no_sample() {
+    let bridge = bridge(124);
+    let _up = up(&bridge);
+    let mut flow = Flow::start(&bridge, |name| participant(name, 124));
+    assert!(bridge.run("tap /scan --raw --count 100").status.success());
+    // A tap that is stopped takes no further slot and returns none.
+    let mut stopped = bridge.start("tap /scan");
+    stopped.wait_for_line("a sample", 0, |line| line.starts_with("sequence=").then_some(()));
+    stopped.signal(Signal::SIGSTOP);
+    flow.wait_more(1_000);
+    stopped.kill9();
+    flow.wait_more(200);
+    flow.end_whole(&bridge);
 }
 
 #[test]
@@ -761,4 +782,6 @@ fn a_lane_on_which_no_route_has_an_output_has_no_process() {
     assert_eq!(unused.status.code(), Some(3));
     assert!(text(&unused.stderr).contains("no route has an output on this lane"), "{}", text(&unused.stderr));
     assert!(up.terminate().success());
+    let has_started = |child: &str| up.log().contains(&format!("started child=\"{child}\""));
+    assert!(has_started("egress-critical") && !has_started("egress-noncritical"), "{}", up.log());
 }
