@@ -455,6 +455,14 @@ fn two_bridges_run_side_by_side_and_the_end_of_one_does_not_affect_the_other() {
     assert!(other_up.terminate().success(), "{}", other_up.log());
     assert_eq!(shared_memory_of(other.instance()), Vec::<String>::new());
     flow.flow_for(1);
+    // The files of the first bridge are still there: the next process of a lane needs them.
+    signal(bed.pid("egress-noncritical"), Signal::SIGKILL);
+    support::wait_until("a restart", || bed.pids("egress-noncritical").len() == 2);
+    bed.bridge.wait_status("the restarted lane", |status| {
+        let mut processes = status["processes"].as_array().into_iter().flatten();
+        processes
+            .any(|one| one["name"] == "egress-noncritical" && one["starts"] == 2 && one["state"] == "running")
+    });
     flow.end_whole();
     bed.end();
 }
