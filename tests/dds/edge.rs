@@ -583,7 +583,8 @@ impl Drop for Held {
 fn what_a_new_writer_writes_at_once_is_sent() {
     let mut here = participant("here", 67);
     let mut there = participant("there", 67);
-    let latched = reader_qos(Reliability::Reliable, Durability::TransientLocal);
+    // All samples may arrive before the first one is taken.
+    let latched = ReaderQos { depth: 256, ..reader_qos(Reliability::Reliable, Durability::TransientLocal) };
     let reader = there.create_reader("rt/latched", TYPE, &latched).unwrap();
     let qos = QosProfile { durability: Durability::TransientLocal, ..QosProfile::CRITICAL };
     let mut expected = BTreeSet::new();
