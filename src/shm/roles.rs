@@ -163,16 +163,13 @@ pub fn instance_files(root: &Path, instance: &InstanceName) -> Vec<PathBuf> {
 
 /// Whether a process holds a lock: by the list `locks`, or by one of the next readings, which replace it.
 fn holds_in_any(locks: &mut String, pid: u32, inode: u64) -> bool {
-    for _ in 1..READINGS {
-        if holds(locks, pid, inode) || pid == 0 {
-            break;
+    let read_again = |locks: &mut String| {
+        if let Ok(read) = fs::read_to_string(LOCKS) {
+            *locks = read;
         }
-        match fs::read_to_string(LOCKS) {
-            Ok(read) => *locks = read,
-            Err(_) => break,
-        }
-    }
-    holds(locks, pid, inode)
+        holds(locks, pid, inode)
+    };
+    holds(locks, pid, inode) || (pid != 0 && (1..READINGS).any(|_| read_again(locks)))
 }
 
 /// Whether the list of locks has an exclusive one of that process on the file with that inode number: a line

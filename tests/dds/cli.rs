@@ -525,7 +525,7 @@ fn a_tap_receives_payloads_bit_for_bit_and_disturbs_no_lane() {
     assert_eq!((words[12], words[13], words[14]), ("window", "300", "lost"), "{hz}");
     let figure = |at: usize| words[at].parse::<f64>().unwrap();
     assert!(figure(4) <= figure(7), "{hz}");
-    // The intervals, in ms, have this rate in the mean.
+    // The intervals, in ms, have this rate in the mean. The publisher writes at 200 Hz at most.
     let between = 1_000.0 / figure(7)..=1_000.0 / figure(4);
     assert!(between.contains(&figure(1)) && figure(1) < 300.0, "{hz}");
 

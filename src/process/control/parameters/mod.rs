@@ -295,7 +295,8 @@ impl SentReplies {
     /// Whether a reply to this reader evicts none that another one, or this one, may still request again.
     fn has_room(&self, reader: &Guid, readers: &[ReaderRecord], now: MonotonicNs) -> bool {
         let is_needed = |sent: &&SentReply| {
-            let lacks = |record: &ReaderRecord| record.offered - record.unacknowledged < sent.offered;
+            let lacks =
+                |record: &ReaderRecord| record.offered.saturating_sub(record.unacknowledged) < sent.offered;
             let is_acknowledged = !readers.iter().any(|record| record.reader == sent.reader && lacks(record));
             let is_own = sent.reader.prefix() == reader.prefix();
             !is_acknowledged && (is_own || now < sent.at.plus_ms(OTHERS_MS))
