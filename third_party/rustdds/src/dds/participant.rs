@@ -508,14 +508,16 @@ impl DomainParticipantBuilder {
     )?;
 
     // outer DP wrapper
+    let dpi = Arc::new(Mutex::new(dp));
     let dp = DomainParticipant {
-      dpi: Arc::new(Mutex::new(dp)),
+      discovery: Some(Arc::new(DiscoveryThread { dpi: dpi.clone() })),
+      dpi,
     };
 
     let (discovery_started_sender, discovery_started_receiver) = std::sync::mpsc::channel();
 
     // Construct and start background thread
-    let dp_clone = dp.weak_clone();
+    let dp_clone = dp.weak_clone().of_discovery();
     let disc_db_clone = dp.discovery_db();
     let discovery_handle = thread::Builder::new()
       .name("RustDDS discovery thread".to_string())
@@ -577,6 +579,9 @@ impl DomainParticipantBuilder {
 #[derive(Clone)]
 // This is a smart pointer for DomainParticipant for easier manipulation.
 pub struct DomainParticipant {
+  // Dropped before `dpi`: the thread that drops the last one ends discovery, then the event loop.
+  // `None` in what the discovery thread has for a moment.
+  discovery: Option<Arc<DiscoveryThread>>,
   dpi: Arc<Mutex<DomainParticipantDisc>>,
 }
 
@@ -925,6 +930,7 @@ impl DomainParticipant {
   /// to get `DomainParticipantStatusEvent`s for this DomainParticipant.
   pub fn status_listener(&self) -> DomainParticipantStatusListener {
     DomainParticipantStatusListener {
+      _discovery: self.discovery.clone(),
       dp_disc: Arc::clone(&self.dpi),
     }
   }
@@ -979,6 +985,8 @@ impl DomainParticipant {
 /// Produces an async (or mio-pollable) stream of
 /// [`DomainParticipantStatusEvent`]s
 pub struct DomainParticipantStatusListener {
+  // It is a handle of the user, too.
+  _discovery: Option<Arc<DiscoveryThread>>,
   dp_disc: Arc<Mutex<DomainParticipantDisc>>,
 }
 
@@ -1189,6 +1197,8 @@ impl PartialEq for DomainParticipant {
 #[derive(Clone)]
 pub struct DomainParticipantWeak {
   dpi: Weak<Mutex<DomainParticipantDisc>>,
+  // `None` in that of the discovery thread.
+  discovery: Option<Weak<DiscoveryThread>>,
   // This struct caches some items to avoid construction deadlocks
   #[cfg(feature = "security")] // just to avoid warning
   domain_id: u16,
@@ -1201,6 +1211,7 @@ impl DomainParticipantWeak {
   pub fn new(dp: &DomainParticipant) -> Self {
     Self {
       dpi: Arc::downgrade(&dp.dpi),
+      discovery: dp.discovery.as_ref().map(Arc::downgrade),
       #[cfg(feature="security")] // just to avoid warning
       domain_id: dp.domain_id(),
       guid: dp.guid(),
@@ -1260,7 +1271,20 @@ impl DomainParticipantWeak {
   }
 
   pub fn upgrade(self) -> Option<DomainParticipant> {
-    self.dpi.upgrade().map(|d| DomainParticipant { dpi: d })
+    let discovery = match &self.discovery {
+      Some(discovery) => Some(discovery.upgrade()?),
+      None => None,
+    };
+    let dpi = self.dpi.upgrade()?;
+    Some(DomainParticipant { discovery, dpi })
+  }
+
+  // For the discovery thread, which must not wait for its own end.
+  fn of_discovery(self) -> Self {
+    Self {
+      discovery: None,
+      ..self
+    }
   }
 } // end impl
 
@@ -1270,8 +1294,7 @@ impl RTPSEntity for DomainParticipantWeak {
   }
 }
 
-// This struct exists only to control and stop Discovery when DomainParticipant
-// should be dropped
+// What the discovery thread shares with the handles of the user, which end it: see `DiscoveryThread`.
 pub(crate) struct DomainParticipantDisc {
   dpi: DomainParticipantInner,
   // Discovery control
@@ -1456,32 +1479,42 @@ impl DomainParticipantDisc {
   }
 }
 
-impl Drop for DomainParticipantDisc {
+// Ends the discovery thread when the last handle of the user is dropped.
+struct DiscoveryThread {
+  dpi: Arc<Mutex<DomainParticipantDisc>>,
+}
+
+impl Drop for DiscoveryThread {
   fn drop(&mut self) {
-    info!("===== RustDDS shutting down ===== .drop() DomainParticipantDisc");
+    info!("===== RustDDS shutting down ===== .drop() DiscoveryThread");
 
-    debug!("Wan dp_event_loop about stop.");
-    if self
-      .dpi
-      .stop_poll_sender
-      .send(EventLoopCommand::PrepareStop)
-      .is_err()
-    {
-      error!("dp_event_loop not responding to prepare stop discovery_command");
-    }
+    // Unlocked before the join: the thread may be about to lock it.
+    let handle = {
+      let disc = self.dpi.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+      debug!("Wan dp_event_loop about stop.");
+      if disc
+        .dpi
+        .stop_poll_sender
+        .send(EventLoopCommand::PrepareStop)
+        .is_err()
+      {
+        error!("dp_event_loop not responding to prepare stop discovery_command");
+      }
 
-    debug!("Sending Discovery Stop signal.");
-    if self
-      .discovery_command_sender
-      .send(DiscoveryCommand::StopDiscovery)
-      .is_err()
-    {
-      warn!("Failed to send stop signal to Discovery");
-      return;
-    }
+      debug!("Sending Discovery Stop signal.");
+      if disc
+        .discovery_command_sender
+        .send(DiscoveryCommand::StopDiscovery)
+        .is_err()
+      {
+        warn!("Failed to send stop signal to Discovery");
+        return;
+      }
+      disc.discovery_join_handle.try_recv()
+    };
 
     debug!("Waiting for Discovery join.");
-    if let Ok(handle) = self.discovery_join_handle.try_recv() {
+    if let Ok(handle) = handle {
       handle
         .join()
         .unwrap_or_else(|e| warn!("Failed to join discovery thread: {e:?}"));
@@ -2255,6 +2288,26 @@ mod tests {
         return identity;
       }
       std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+  }
+
+  // The discovery thread has a handle for a moment, for example while it announces the participant, and may
+  // not be the one that drops the last.
+  #[test]
+  fn a_participant_that_is_dropped_has_ended_its_threads() {
+    for round in 0..1_000 {
+      let held = std::sync::Arc::new(());
+      let of_hook = held.clone();
+      let participant = DomainParticipantBuilder::new(test_domain_id(44))
+        .on_received(move || {
+          let _ = &of_hook;
+          false
+        })
+        .build()
+        .unwrap();
+      std::thread::sleep(std::time::Duration::from_micros(round % 100 * 10));
+      drop(participant);
+      assert_eq!(std::sync::Arc::strong_count(&held), 1, "round {round}: a thread runs on");
     }
   }
 
