@@ -14,7 +14,7 @@ use super::error::RoleError;
 use super::kept_sockets;
 use super::place::MAX_AWAY_MS;
 use super::role::Role;
-use super::standby::{Leave, Successor};
+use super::successor::{Leave, Successor};
 use crate::clock;
 use crate::config::Standby;
 use crate::dds::{DdsError, Kept, Participant, ParticipantIdentity, ParticipantOptions, host_addresses};

@@ -99,10 +99,12 @@ pub(super) fn take_back(connection: BorrowedFd<'_>) {
     let _ = send(connection.as_raw_fd(), FORGET, &[]);
 }
 
-/// Says to a standby that this process ends because it was asked to.
-pub(super) fn say_stopping(connection: BorrowedFd<'_>) {
-    // A connection that has ended has no standby.
-    let _ = send(connection.as_raw_fd(), STOPPING, &[]);
+/// Says to a standby that this process ends because it was asked to. The standby then takes over.
+///
+/// # Errors
+/// The standby has ended, or is about to and takes nothing over any more.
+pub(super) fn say_stopping(connection: BorrowedFd<'_>) -> io::Result<()> {
+    send(connection.as_raw_fd(), STOPPING, &[])
 }
 
 /// Makes the supervisor close the sockets that it keeps for this process.

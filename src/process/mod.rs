@@ -28,6 +28,7 @@ mod scheduling;
 mod socket_store;
 mod standby;
 mod stop;
+mod successor;
 mod supervisor;
 #[cfg(test)]
 mod test_role;

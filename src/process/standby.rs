@@ -3,29 +3,26 @@
 //!
 //! Both are the same program with the same arguments; the one that finds the role taken waits. The active
 //! process connects to the socket of the standby and sends it duplicates of its own UDP sockets, in which the
-//! kernel goes on queueing datagrams when the process ends ([`Successor`]). It keeps the connection open, so
-//! that its end wakes the standby.
+//! kernel goes on queueing datagrams when the process ends ([`Successor`](super::successor::Successor)). It
+//! keeps the connection open, so that its end wakes the standby.
 
-use std::fs;
-use std::io::{self, ErrorKind};
+use std::io;
 use std::net::UdpSocket;
-use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::net::UnixListener;
-use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::{Signal, kill};
-use nix::sys::socket::{
-    AddressFamily, Backlog, SockFlag, SockType, UnixAddr, bind, connect, getsockopt, listen, socket, sockopt,
-};
+use nix::sys::socket::{getsockopt, sockopt};
 use nix::unistd::Pid;
-use tracing::{debug, info, warn};
+use tracing::{info, warn};
 
 use super::error::RoleError;
 use super::kept_sockets::{self, Request};
 use super::notify::Notifier;
 use super::stop::Stop;
+use super::successor::{decline, listen_at};
 use crate::clock;
 use crate::config::Settings;
 use crate::model::{MonotonicNs, ProcessHealth, StandbyRecord, TakeOverCause};
@@ -53,11 +50,9 @@ pub(super) const NO_WATCHDOG_VARIABLE: &str = "ADAPTIVE_BRIDGE_NO_WATCHDOG";
 /// How long a standby tries to take the role after the connection has ended: the kernel closes the files of a
 /// process one after the other, within microseconds.
 const END_MS: u64 = 100;
+/// The same for a standby that was asked to end, and is the last process of the role.
+const LAST_END_MS: u64 = 1_000;
 const END_POLL: Duration = Duration::from_micros(100);
-
-/// How long a process that was asked to end serves on, to see whether its standby ends as well: that checks
-/// for a request each [`POLL_MS`].
-const LEAVE_MS: u64 = 100;
 
 /// How long a standby that has no sockets of the active process leaves the role to another process, which may
 /// have them from its supervisor.
@@ -240,7 +235,7 @@ impl Waiting {
             self.receive()?;
             let is_heir = self.cause == TakeOverCause::HandedOver
                 || (self.active.is_none() && !self.sockets.is_empty());
-            if is_stopping && !is_heir {
+            if is_stopping && !is_heir && self.has_declined() {
                 break;
             }
             if self.active.is_some() {
@@ -248,7 +243,8 @@ impl Waiting {
                 continue;
             }
             self.ended_at = clock::monotonic();
-            let try_until = if was_connected { self.ended_at.plus_ms(END_MS) } else { self.ended_at };
+            let end_ms = if is_stopping { LAST_END_MS } else { END_MS };
+            let try_until = if was_connected { self.ended_at.plus_ms(end_ms) } else { self.ended_at };
             let Some(lock) = self.take(settings, name, try_until)? else {
                 if is_stopping {
                     break;
@@ -296,7 +292,14 @@ impl Waiting {
             }
             return Ok(());
         };
-        match kept_sockets::receive(&active.connection) {
+        let request = kept_sockets::receive(&active.connection);
+        self.heed(request);
+        Ok(())
+    }
+
+    /// Applies a message of the active process; `None` if its connection has failed.
+    fn heed(&mut self, request: Option<Request>) {
+        match request {
             Some(Request::Store(sockets)) => (self.sockets, self.is_taken_back) = (sockets, false),
             Some(Request::Forget) => {
                 self.sockets.clear();
@@ -305,7 +308,18 @@ impl Waiting {
             Some(Request::Stopping) => self.cause = TakeOverCause::HandedOver,
             Some(Request::Unknown) | None => self.active = None,
         }
-        Ok(())
+    }
+
+    /// Tells the active process that this one takes nothing over any more; false if it has handed over.
+    fn has_declined(&mut self) -> bool {
+        if let Some(active) = &self.active {
+            decline(&active.connection);
+        }
+        while let Some(active) = &self.active {
+            let request = kept_sockets::receive(&active.connection);
+            self.heed(request);
+        }
+        self.cause != TakeOverCause::HandedOver
     }
 
     /// Kills the active process if a signal has stopped it or if it makes no progress: continued later, it
@@ -383,180 +397,4 @@ impl TakeOver {
 #[allow(clippy::disallowed_methods, reason = "a standby handles no samples")]
 fn pause(time: Duration) {
     std::thread::sleep(time);
-}
-
-fn listen_at(path: &Path) -> io::Result<UnixListener> {
-    // One that a former standby has left; this process has the right to wait.
-    match fs::remove_file(path) {
-        Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
-        _ => {}
-    }
-    let listener = open_socket()?;
-    bind(listener.as_raw_fd(), &Address::of(path)?.address)?;
-    listen(&listener, Backlog::new(1)?)?;
-    Ok(listener.into())
-}
-
-/// The address of a socket whose path may be longer than an address (107 bytes).
-struct Address {
-    address: UnixAddr,
-    /// The address is relative to it.
-    _folder: fs::File,
-}
-
-impl Address {
-    fn of(path: &Path) -> io::Result<Self> {
-        let (Some(folder), Some(name)) = (path.parent(), path.file_name()) else {
-            return Err(ErrorKind::InvalidInput.into());
-        };
-        let folder = fs::File::open(folder)?;
-        let path = Path::new("/proc/self/fd").join(folder.as_raw_fd().to_string()).join(name);
-        Ok(Self { address: UnixAddr::new(&path)?, _folder: folder })
-    }
-}
-
-/// A socket that keeps the bounds of messages, and never blocks.
-fn open_socket() -> nix::Result<OwnedFd> {
-    let flags = SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK;
-    socket(AddressFamily::Unix, SockType::SeqPacket, flags, None)
-}
-
-/// How a process ends that was asked to.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(super) enum Leave {
-    /// Not yet: its standby may have been asked to end, too.
-    Soon,
-    /// Without goodbye: its standby goes on as the same participant.
-    HandOver,
-    /// With goodbye, as there is no standby.
-    ForGood,
-}
-
-/// Sends the sockets of this process to its standby, as soon as there is one.
-pub(super) struct Successor {
-    path: PathBuf,
-    address: Option<Address>,
-    sockets: Vec<UdpSocket>,
-    connection: Option<OwnedFd>,
-    /// From when on the process may hand over; `None` if it was not asked to end.
-    leave_at: Option<MonotonicNs>,
-}
-
-impl Successor {
-    /// `path` is the socket of the standby.
-    pub fn new(path: PathBuf, sockets: Vec<UdpSocket>) -> Self {
-        Self { path, address: None, sockets, connection: None, leave_at: None }
-    }
-
-    /// How the process ends now that it was asked to.
-    pub fn leave(&mut self, now: MonotonicNs) -> Leave {
-        // It may have started since the last housekeeping.
-        self.housekeeping();
-        let serves_soon = |standby: &OwnedFd| !has_ended(standby) && !is_stopped(standby);
-        if self.sockets.is_empty() || !self.connection.as_ref().is_some_and(serves_soon) {
-            return Leave::ForGood;
-        }
-        let leave_at = *self.leave_at.get_or_insert(now.plus_ms(LEAVE_MS));
-        if now < leave_at {
-            return Leave::Soon;
-        }
-        if let Some(connection) = &self.connection {
-            kept_sockets::say_stopping(connection.as_fd());
-        }
-        Leave::HandOver
-    }
-
-    /// Connects to a standby that has none of the sockets. Never waits; some 5 µs without a standby.
-    pub fn housekeeping(&mut self) {
-        if self.connection.as_ref().is_some_and(has_ended) {
-            self.connection = None;
-        }
-        if self.connection.is_some() || self.sockets.is_empty() {
-            return;
-        }
-        match self.connect() {
-            Ok(connection) => self.connection = Some(connection),
-            Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::ConnectionRefused) => {}
-            Err(error) => debug!(%error, "cannot send the sockets to the standby"),
-        }
-    }
-
-    fn connect(&mut self) -> io::Result<OwnedFd> {
-        // Once, because housekeeping allocates nothing.
-        let address = match &self.address {
-            Some(address) => address,
-            None => self.address.insert(Address::of(&self.path)?),
-        };
-        let connection = open_socket()?;
-        connect(connection.as_raw_fd(), &address.address)?;
-        kept_sockets::hand_over(connection.as_fd(), &self.sockets)?;
-        Ok(connection)
-    }
-
-    /// Makes the standby close the sockets: it will be another participant.
-    pub fn end(&mut self) {
-        self.sockets.clear();
-        if let Some(connection) = &self.connection {
-            kept_sockets::take_back(connection.as_fd());
-        }
-    }
-}
-
-/// Whether SIGSTOP has stopped the process that listens at the other end of a connection, as far as this one
-/// can see.
-fn is_stopped(connection: &OwnedFd) -> bool {
-    getsockopt(connection, sockopt::PeerCredentials)
-        .is_ok_and(|standby| StatFile::open(standby.pid()).is_ok_and(|stat| stat.is_stopped()))
-}
-
-/// Whether the other end of a connection, which sends nothing, is closed.
-fn has_ended(connection: &OwnedFd) -> bool {
-    let mut polled = [PollFd::new(connection.as_fd(), PollFlags::POLLIN)];
-    poll(&mut polled, PollTimeout::ZERO).is_ok_and(|ready| ready > 0)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn at(ms: u64) -> MonotonicNs {
-        MonotonicNs(0).plus_ms(ms)
-    }
-
-    #[test]
-    fn a_process_hands_over_to_a_standby_that_does_not_end_as_well() {
-        let folder = tempfile::tempdir().unwrap();
-        // Longer than the address of a socket.
-        let folder = folder.path().join("f".repeat(200));
-        fs::create_dir(&folder).unwrap();
-        let path = folder.join("standby");
-        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
-        let mut active = Successor::new(path.clone(), vec![socket]);
-        active.housekeeping();
-        assert_eq!(active.leave(at(0)), Leave::ForGood, "no standby");
-
-        let standby = listen_at(&path).unwrap();
-        assert_eq!(active.leave(at(1_000)), Leave::Soon);
-        let (connection, _) = standby.accept().unwrap();
-        assert_eq!(active.leave(at(1_000 + LEAVE_MS - 1)), Leave::Soon);
-        assert_eq!(active.leave(at(1_000 + LEAVE_MS)), Leave::HandOver);
-        let received = || kept_sockets::receive(&connection);
-        assert!(matches!(received(), Some(Request::Store(sockets)) if sockets.len() == 1));
-        assert!(matches!(received(), Some(Request::Stopping)));
-        drop((connection, standby));
-        assert_eq!(active.leave(at(1_000 + LEAVE_MS)), Leave::ForGood, "the standby has ended");
-    }
-
-    #[test]
-    fn a_process_that_gives_up_its_identity_does_not_hand_over() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("standby");
-        let standby = listen_at(&path).unwrap();
-        let mut active = Successor::new(path, vec![UdpSocket::bind("127.0.0.1:0").unwrap()]);
-        active.housekeeping();
-        let _connection = standby.accept().unwrap();
-        assert_eq!(active.leave(at(0)), Leave::Soon);
-        active.end();
-        assert_eq!(active.leave(at(LEAVE_MS)), Leave::ForGood);
-    }
 }
