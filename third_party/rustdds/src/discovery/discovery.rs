@@ -20,7 +20,7 @@ use crate::{
       QosPolicies, QosPolicyBuilder,
     },
     readcondition::ReadCondition,
-    result::{CreateError, CreateResult},
+    result::{CreateError, CreateResult, ReadError},
     statusevents::{DomainParticipantStatusEvent, LostReason, StatusChannelSender},
   },
   discovery::{
@@ -1318,6 +1318,7 @@ impl Discovery {
           trace!("spdp_receive: no more data");
           return;
         } // no more data
+        Err(e) if skips_malformed(&self.discovery_db, &e) => (),
         Err(e) => {
           error!(" !!! spdp_receive: {e:?}");
           return;
@@ -1635,9 +1636,9 @@ impl Discovery {
 
   // Check if there are messages about new Readers
   pub fn sedp_receive_subscription(&mut self, read_history: Option<GuidPrefix>) {
-    let drds: Vec<Sample<DiscoveredReaderData, GUID>> =
+    let drds: Vec<Sample<DiscoveredReaderData, GUID>> = loop {
       match self.dcps_subscription.reader.into_iterator() {
-        Ok(ds) => ds
+        Ok(ds) => break ds
           .map(|d| d.map_dispose(|g| g.0)) // map_dispose removes Endpoint_GUID wrapper around GUID
           // into_iterator() took these samples out of the reader, so all of them
           // must be processed, also when a participant was specified. A sample
@@ -1655,11 +1656,13 @@ impl Discovery {
             }
           })
           .collect(),
+        Err(e) if skips_malformed(&self.discovery_db, &e) => (),
         Err(e) => {
           error!("sedp_receive_subscription: {e:?}");
           return;
         }
-      };
+      }
+    };
 
     for d in drds {
       #[cfg(not(feature = "security"))]
@@ -1707,12 +1710,12 @@ impl Discovery {
   }
 
   pub fn sedp_receive_publication(&mut self, read_history: Option<GuidPrefix>) {
-    let dwds: Vec<Sample<DiscoveredWriterData, GUID>> =
+    let dwds: Vec<Sample<DiscoveredWriterData, GUID>> = loop {
       match self.dcps_publication.reader.into_iterator() {
         // a lot of cloning here, but we must copy the data out of the
         // reader before we can use self again, as .read() returns references to within
         // a reader and thus self
-        Ok(ds) => ds
+        Ok(ds) => break ds
           .map(|d| d.map_dispose(|g| g.0)) // map_dispose removes Endpoint_GUID wrapper around GUID
           // into_iterator() took these samples out of the reader, so all of them
           // must be processed, also when a participant was specified. A sample
@@ -1730,11 +1733,13 @@ impl Discovery {
             }
           })
           .collect(),
+        Err(e) if skips_malformed(&self.discovery_db, &e) => (),
         Err(e) => {
           error!("sedp_receive_publication: {e:?}");
           return;
         }
-      };
+      }
+    };
 
     for d in dwds {
       #[cfg(not(feature = "security"))]
@@ -1778,23 +1783,22 @@ impl Discovery {
   // DomainParticipants timing out and then coming back. The read_history was
   // supposed to help in recovering from that.
   pub fn sedp_receive_topic_data(&mut self, _read_history: Option<GuidPrefix>) {
-    let ts: Vec<Sample<(DiscoveredTopicData, GUID), GUID>> = match self
-      .dcps_topic
-      .reader
-      .take(usize::MAX, ReadCondition::any())
-    {
-      Ok(ds) => ds
-        .iter()
-        .map(|d| {
-          d.value
-            .clone()
-            .map_value(|o| (o, d.sample_info.writer_guid()))
-            .map_dispose(|g| g.0)
-        })
-        .collect(),
-      Err(e) => {
-        error!("sedp_receive_topic_data: {e:?}");
-        return;
+    let ts: Vec<Sample<(DiscoveredTopicData, GUID), GUID>> = loop {
+      match self.dcps_topic.reader.take(usize::MAX, ReadCondition::any()) {
+        Ok(ds) => break ds
+          .iter()
+          .map(|d| {
+            d.value
+              .clone()
+              .map_value(|o| (o, d.sample_info.writer_guid()))
+              .map_dispose(|g| g.0)
+          })
+          .collect(),
+        Err(e) if skips_malformed(&self.discovery_db, &e) => (),
+        Err(e) => {
+          error!("sedp_receive_topic_data: {e:?}");
+          return;
+        }
       }
     };
 
@@ -1860,15 +1864,14 @@ impl Discovery {
   // and manual (by by application, via DDS API call) liveness
   pub fn receive_participant_message(&mut self) {
     // First read from nonsecure reader
-    let mut samples = match self
-      .dcps_participant_message
-      .reader
-      .take(usize::MAX, ReadCondition::any())
-    {
-      Ok(nonsecure_samples) => nonsecure_samples,
-      Err(e) => {
-        error!("receive_participant_message: {e:?}");
-        return;
+    let mut samples = loop {
+      match self.dcps_participant_message.reader.take(usize::MAX, ReadCondition::any()) {
+        Ok(nonsecure_samples) => break nonsecure_samples,
+        Err(e) if skips_malformed(&self.discovery_db, &e) => (),
+        Err(e) => {
+          error!("receive_participant_message: {e:?}");
+          return;
+        }
       }
     };
 
@@ -2652,6 +2655,17 @@ impl Discovery {
 // -----------------------------------------------------------------------
 // -----------------------------------------------------------------------
 
+// Whether the reader has skipped what it could not decode: announcements of others are behind it, and
+// no notification may follow.
+fn skips_malformed(discovery_db: &Arc<RwLock<DiscoveryDB>>, error: &ReadError) -> bool {
+  let is_malformed = matches!(error, ReadError::Deserialization { .. });
+  if is_malformed {
+    debug!("A malformed announcement is skipped: {error:?}");
+    discovery_db_read(discovery_db).counters().malformed_datagrams.increment();
+  }
+  is_malformed
+}
+
 #[cfg(test)]
 mod tests {
   use std::net::SocketAddr;
@@ -2820,6 +2834,56 @@ mod tests {
       return;
     }
     panic!("held up each time");
+  }
+
+  // All in one datagram, so that one notification may be for all of them.
+  #[test]
+  #[cfg(not(feature = "security"))]
+  fn an_announcement_behind_malformed_ones_is_read() {
+    const MALFORMED: i64 = 40;
+
+    let domain = test_domain_id(43);
+    let port = spdp_well_known_unicast_port(domain, 5);
+    let neighbour = std::net::UdpSocket::bind(("127.0.0.1", port)).unwrap();
+    let participant = DomainParticipant::new(domain).expect("participant creation");
+    // Its built-in readers are there once it announces itself.
+    let in_20_s = std::time::Instant::now() + StdDuration::from_secs(20);
+    assert!(receives_announcement(&neighbour, participant.guid().prefix, in_20_s), "no announcement");
+    let newcomer = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    let mut message = spdp_participant_msg_mod(newcomer.local_addr().unwrap().port());
+    let (data, other): (Vec<_>, Vec<_>) = message.submessages.into_iter().partition(|submessage| {
+      matches!(submessage.body, SubmessageBody::Writer(WriterSubmessage::Data(..)))
+    });
+    message.submessages = other;
+    for number in 1..=MALFORMED + 1 {
+      let mut submessage = data[0].clone();
+      let SubmessageBody::Writer(WriterSubmessage::Data(data, _)) = &mut submessage.body else {
+        unreachable!("partitioned above");
+      };
+      data.writer_sn = crate::structure::sequence_number::SequenceNumber::new(number);
+      if number <= MALFORMED {
+        // One without the GUID of the participant.
+        let mut payload = data.unwrap_serialized_payload_value().to_vec();
+        let at = payload.windows(4).position(|parameter| parameter == [0x50, 0, 16, 0]);
+        payload[at.unwrap()] = 0x51;
+        data.update_serialized_payload_value(payload.into());
+      }
+      message.submessages.push(submessage);
+    }
+    let datagram = message.write_to_vec_with_ctx(Endianness::LittleEndian).unwrap();
+    for participant_id in 0..5 {
+      let port = spdp_well_known_unicast_port(domain, participant_id);
+      newcomer.send_to(&datagram, ("127.0.0.1", port)).unwrap();
+    }
+    let db = participant.discovery_db();
+    let is_known = || discovery_db_read(&db).find_participant_proxy(message.header.guid_prefix).is_some();
+    let give_up_at = std::time::Instant::now() + StdDuration::from_secs(20);
+    while !is_known() {
+      let counts = participant.network_counters().counts();
+      assert!(std::time::Instant::now() < give_up_at, "not read: {counts:?}");
+      std::thread::sleep(StdDuration::from_millis(10));
+    }
+    assert!(participant.network_counters().counts().malformed_datagrams >= MALFORMED as u64);
   }
 
   #[test]
