@@ -1,15 +1,27 @@
 //! Changes of remote readers, writers and participants, as discovery reports them.
 
+use std::collections::{BTreeMap, BTreeSet};
+use std::pin::pin;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::task::{Context, Poll, Wake, Waker};
+use std::time::Duration;
+
+use futures_core::Stream;
+
 use super::qos::{durability_of, reliability_of};
-use super::rustdds::{DomainParticipantStatusEvent, EndpointDescription, LostReason};
-use crate::model::{Durability, Guid, Reliability, TypeHash};
+use super::rustdds::{
+    DomainParticipant, DomainParticipantStatusEvent, DomainParticipantStatusListener, EndpointDescription,
+    LostReason, StatusEvented,
+};
+use crate::model::{Durability, Guid, MonotonicNs, Reliability, TypeHash};
 use crate::policy::Location;
 
 /// The most announced addresses of an endpoint that are kept. A host has fewer.
 const MAX_ADDRESSES: usize = 64;
 
 /// The most changes that wait for [`Participant::poll_discovery`](super::Participant::poll_discovery): those
-/// beyond are lost.
+/// beyond are lost, and found by [`Participant::find_missed`](super::Participant::find_missed).
 pub(super) const MAX_WAITING_CHANGES: usize = 2_048;
 
 /// The changes of discovery that the caller still takes before it does its other work: as many as can wait. A
@@ -75,8 +87,162 @@ pub enum Discovery {
     },
 }
 
+/// The shortest time between two searches for missed changes, each of which takes some milliseconds with
+/// 16,384 readers and as many writers.
+const FIND_MISSED_MS: u64 = 1_000;
+
+/// The changes that discovery reports to a participant.
+pub(super) struct Changes {
+    listener: DomainParticipantStatusListener,
+    /// Called for the first change after `poll` has found none.
+    waker: Waker,
+    woken: Receiver<()>,
+    reported: Reported,
+    find_missed_at: MonotonicNs,
+}
+
+impl Changes {
+    pub fn of(participant: &DomainParticipant) -> Self {
+        let (waker, woken) = sync_channel(1);
+        Self {
+            listener: participant.status_listener(),
+            waker: Waker::from(Arc::new(DiscoveryWaker(waker))),
+            woken,
+            reported: Reported::default(),
+            find_missed_at: MonotonicNs::default(),
+        }
+    }
+
+    /// Waits until there is a change that [`poll`](Self::poll) has not returned, or for `most`.
+    #[allow(clippy::disallowed_methods, reason = "no thread of the data path waits for discovery")]
+    pub fn wait(&self, most: Duration) {
+        // It times out, and cannot be disconnected: the waker is a field of this one.
+        let _ = self.woken.recv_timeout(most);
+    }
+
+    /// The next change, if there is one and `turn` still takes one.
+    pub fn poll(&mut self, turn: &mut DiscoveryTurn) -> Option<Discovery> {
+        let mut changes = pin!(self.listener.as_async_status_stream());
+        let mut context = Context::from_waker(&self.waker);
+        while turn.takes_another() {
+            let Poll::Ready(Some(change)) = changes.as_mut().poll_next(&mut context) else { return None };
+            if let Some(change) = translate(change) {
+                self.reported.note(&change);
+                return Some(change);
+            }
+        }
+        None
+    }
+
+    /// What [`poll`](Self::poll) has not told, if more changes waited than can; `None` within a second after
+    /// the last search.
+    pub fn find_missed(
+        &mut self,
+        participant: &DomainParticipant,
+        now: MonotonicNs,
+    ) -> Option<Vec<Discovery>> {
+        if now < self.find_missed_at || !self.listener.has_missed_events() {
+            return None;
+        }
+        self.find_missed_at = now.plus_ms(FIND_MISSED_MS);
+        let mut present = BTreeSet::new();
+        let found = participant.discovered_besides(|guid| {
+            let guid = Guid(guid.to_bytes());
+            present.insert(guid);
+            self.reported.contains(guid)
+        });
+        let mut missed = self.reported.ended(&present);
+        missed.extend(found.into_iter().filter_map(translate));
+        missed.iter().for_each(|change| self.reported.note(change));
+        Some(missed)
+    }
+}
+
+/// Ends the wait for discovery.
+struct DiscoveryWaker(SyncSender<()>);
+
+impl Wake for DiscoveryWaker {
+    fn wake(self: Arc<Self>) {
+        // If the channel is full, the waiting thread is awake already.
+        let _ = self.0.try_send(());
+    }
+}
+
+/// The remote endpoints that were reported to the caller, to find what it was not told.
+#[derive(Debug, Default)]
+struct Reported {
+    /// Whether each is a writer.
+    endpoints: BTreeMap<Guid, bool>,
+}
+
+impl Reported {
+    /// Notes a change that is about to be reported.
+    pub fn note(&mut self, change: &Discovery) {
+        match change {
+            Discovery::Writer(writer) => {
+                self.endpoints.insert(writer.guid, true);
+            }
+            Discovery::Reader(reader) => {
+                self.endpoints.insert(reader.guid, false);
+            }
+            Discovery::WriterGone(guid) | Discovery::ReaderGone(guid) => {
+                self.endpoints.remove(guid);
+            }
+            Discovery::ParticipantGone { prefix, .. } => {
+                let of_participant = self.endpoints.range(first_of(*prefix)..=last_of(*prefix));
+                for guid in of_participant.map(|(guid, _)| *guid).collect::<Vec<_>>() {
+                    self.endpoints.remove(&guid);
+                }
+            }
+        }
+    }
+
+    pub fn contains(&self, guid: Guid) -> bool {
+        self.endpoints.contains_key(&guid)
+    }
+
+    /// The ends of those that are not among the `present` ones. A participant of which none is present counts
+    /// as gone.
+    pub fn ended(&self, present: &BTreeSet<Guid>) -> Vec<Discovery> {
+        let mut ended = Vec::new();
+        for (guid, is_writer) in self.endpoints.iter().filter(|(guid, _)| !present.contains(guid)) {
+            let prefix = guid.prefix();
+            if present.range(first_of(prefix)..=last_of(prefix)).next().is_some() {
+                ended.push(if *is_writer {
+                    Discovery::WriterGone(*guid)
+                } else {
+                    Discovery::ReaderGone(*guid)
+                });
+            } else {
+                let gone = Discovery::ParticipantGone { prefix, silent_ms: None };
+                if ended.last() != Some(&gone) {
+                    ended.push(gone);
+                }
+            }
+        }
+        ended
+    }
+}
+
+/// The lowest GUID of a participant.
+fn first_of(prefix: [u8; 12]) -> Guid {
+    with_entity(prefix, [0; 4])
+}
+
+/// The highest GUID of a participant.
+fn last_of(prefix: [u8; 12]) -> Guid {
+    with_entity(prefix, [0xff; 4])
+}
+
+fn with_entity(prefix: [u8; 12], entity: [u8; 4]) -> Guid {
+    let mut guid = [0; 16];
+    guid[..12].copy_from_slice(&prefix);
+    guid[12..].copy_from_slice(&entity);
+    Guid(guid)
+}
+
 /// Converts an event of RustDDS; `None` for one that the bridge does not use.
-pub(super) fn translate(event: DomainParticipantStatusEvent) -> Option<Discovery> {
+fn translate(event: DomainParticipantStatusEvent) -> Option<Discovery> {
     use DomainParticipantStatusEvent as Event;
     match event {
         // DDS 1.4, table in clause 2.2.3: the default RELIABILITY is RELIABLE for writers and BEST_EFFORT for
@@ -123,6 +289,73 @@ fn endpoint(description: EndpointDescription, default_reliability: Reliability) 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn endpoint(participant: u8, entity: u8) -> Endpoint {
+        Endpoint {
+            guid: with_entity([participant; 12], [0, 0, entity, 3]),
+            topic: "rt/scan".to_owned(),
+            dds_type: "T".to_owned(),
+            type_hash: TypeHash::default(),
+            reliability: Reliability::Reliable,
+            durability: Durability::Volatile,
+            location: Location { seen_from: None, announced: Vec::new() },
+        }
+    }
+
+    #[test]
+    fn more_publishers_at_a_time_than_changes_can_wait_are_all_found() {
+        let domain_id = 165;
+        let participant = DomainParticipant::new(domain_id).unwrap();
+        let mut changes = Changes::of(&participant);
+        let other = DomainParticipant::new(domain_id).unwrap();
+        let qos = super::super::rustdds::QosPolicies::qos_none();
+        let publisher = other.create_publisher(&qos).unwrap();
+        let kind = super::super::rustdds::TopicKind::NoKey;
+        let topic = other.create_topic("many".to_owned(), "T".to_owned(), &qos, kind).unwrap();
+        let writers: Vec<_> = (0..MAX_WAITING_CHANGES + 200)
+            .map(|_| publisher.create_datawriter_no_key_cdr::<u32>(&topic, None).unwrap())
+            .collect();
+        while participant.discovered_writers().len() < writers.len() {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+
+        let mut told = BTreeSet::new();
+        let mut tell = |change| match change {
+            Discovery::Writer(writer) => told.insert(writer.guid),
+            _ => false,
+        };
+        let mut turn = DiscoveryTurn::default();
+        while let Some(change) = changes.poll(&mut turn) {
+            tell(change);
+        }
+        let missed = changes.find_missed(&participant, MonotonicNs(1)).unwrap();
+        assert!(!missed.is_empty());
+        missed.into_iter().for_each(|change| {
+            tell(change);
+        });
+        assert!(writers.iter().all(|writer| {
+            let guid = super::super::rustdds::RTPSEntity::guid(writer);
+            told.contains(&Guid(guid.to_bytes()))
+        }));
+        assert!(changes.find_missed(&participant, MonotonicNs(2)).is_none());
+    }
+
+    #[test]
+    fn what_has_ended_without_a_report_is_found() {
+        let mut reported = Reported::default();
+        let guid = |participant, entity| endpoint(participant, entity).guid;
+        for participant in 1..=4 {
+            reported.note(&Discovery::Writer(endpoint(participant, 1)));
+            reported.note(&Discovery::Reader(endpoint(participant, 2)));
+        }
+        reported.note(&Discovery::ParticipantGone { prefix: [3; 12], silent_ms: None });
+        reported.note(&Discovery::WriterGone(guid(4, 1)));
+        assert!(!reported.contains(guid(3, 1)) && !reported.contains(guid(4, 1)));
+        assert!(reported.contains(guid(2, 2)) && reported.contains(guid(4, 2)));
+        let present = [guid(1, 2), guid(4, 2), guid(4, 9)].into();
+        let gone = Discovery::ParticipantGone { prefix: [2; 12], silent_ms: None };
+        assert_eq!(reported.ended(&present), [Discovery::WriterGone(guid(1, 1)), gone]);
+    }
 
     #[test]
     fn a_turn_takes_as_many_changes_as_can_wait() {

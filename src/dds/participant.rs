@@ -2,18 +2,14 @@
 
 use std::io;
 use std::net::UdpSocket;
-use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::task::{Context, Poll, Wake, Waker};
 use std::time::Duration;
 
 use bytes::Bytes;
-use futures_core::Stream;
 
 use super::arrivals::Arrivals;
-use super::discovery::{Discovery, DiscoveryTurn, translate};
+use super::discovery::{Changes, Discovery, DiscoveryTurn};
 use super::error::DdsError;
 use super::graph;
 use super::graph_watch::{GraphWatch, MAX_PARTICIPANTS};
@@ -22,9 +18,8 @@ use super::network;
 use super::qos::{self, ReaderQos};
 use super::reader::RawReader;
 use super::rustdds::{
-    DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, GUID, NetworkCounters,
-    Publisher, QosPolicies, RTPSEntity, SequenceNumber, StatusEvented, Subscriber, ThreadTurns, Topic,
-    TopicKind,
+    DomainParticipant, DomainParticipantBuilder, GUID, NetworkCounters, Publisher, QosPolicies, RTPSEntity,
+    SequenceNumber, Subscriber, ThreadTurns, Topic, TopicKind,
     dds::result::{CreateError, CreateResult},
 };
 use super::writer::RawWriter;
@@ -56,10 +51,7 @@ pub struct Participant {
     graph: RawWriter,
     /// The highest sequence number of `graph`.
     graph_number: Arc<AtomicI64>,
-    listener: DomainParticipantStatusListener,
-    /// Called for the first change after `poll_discovery` has found none.
-    discovery_waker: Waker,
-    discovery_woken: Receiver<()>,
+    changes: Changes,
     publisher: Publisher,
     subscriber: Subscriber,
     participant: DomainParticipant,
@@ -180,8 +172,7 @@ impl Participant {
         let none = QosPolicies::qos_none();
         let publisher = participant.create_publisher(&none).map_err(failed)?;
         let subscriber = participant.create_subscriber(&none).map_err(failed)?;
-        let listener = participant.status_listener();
-        let (waker, discovery_woken) = sync_channel(1);
+        let changes = Changes::of(&participant);
         let number = Arc::new(AtomicI64::new(graph_number));
         let told = Arc::clone(&number);
         let continuation = WriterContinuation {
@@ -205,9 +196,7 @@ impl Participant {
             participant,
             publisher,
             subscriber,
-            listener,
-            discovery_waker: Waker::from(Arc::new(DiscoveryWaker(waker))),
-            discovery_woken,
+            changes,
             graph,
             graph_number: number,
             namespace: options.namespace.clone(),
@@ -515,23 +504,30 @@ impl Participant {
 
     /// Waits until discovery reports a change that [`poll_discovery`](Self::poll_discovery) has not returned,
     /// or for `most`. It may return earlier.
-    #[allow(clippy::disallowed_methods, reason = "no thread of the data path waits for discovery")]
     pub fn wait_for_discovery(&self, most: Duration) {
-        // It times out, and cannot be disconnected: the waker is a field of this participant.
-        let _ = self.discovery_woken.recv_timeout(most);
+        self.changes.wait(most);
     }
 
     /// Returns the next change that discovery reports, if there is one and `turn` still takes one.
-    pub fn poll_discovery(&self, turn: &mut DiscoveryTurn) -> Option<Discovery> {
-        let mut changes = pin!(self.listener.as_async_status_stream());
-        let mut context = Context::from_waker(&self.discovery_waker);
-        while turn.takes_another() {
-            let Poll::Ready(Some(change)) = changes.as_mut().poll_next(&mut context) else { return None };
-            if let Some(change) = translate(change) {
-                return Some(change);
-            }
+    pub fn poll_discovery(&mut self, turn: &mut DiscoveryTurn) -> Option<Discovery> {
+        self.changes.poll(turn)
+    }
+
+    /// Returns the readers and writers of which [`poll_discovery`](Self::poll_discovery) has not told, and
+    /// the ends of those that are gone, if more changes waited than can: at most once a second, because it
+    /// looks at all that discovery has. To be called after `poll_discovery`. The hosts of what it finds are
+    /// known by their announced addresses alone.
+    pub fn find_missed(&mut self, now: MonotonicNs) -> Vec<Discovery> {
+        let missed = self.changes.find_missed(&self.participant, now);
+        if let Some(missed) = &missed {
+            let (node, changes) = (&self.node_name, missed.len());
+            tracing::warn!(
+                node,
+                changes,
+                "discovery reported more changes at a time than can wait; found them"
+            );
         }
-        None
+        missed.unwrap_or_default()
     }
 
     fn publish_graph_entry(&self) {
@@ -548,16 +544,6 @@ impl Participant {
         {
             tracing::warn!(node = self.node_name, %error, "cannot publish the node's ROS 2 graph entry");
         }
-    }
-}
-
-/// Ends the wait for discovery.
-struct DiscoveryWaker(SyncSender<()>);
-
-impl Wake for DiscoveryWaker {
-    fn wake(self: Arc<Self>) {
-        // If the channel is full, the waiting thread is awake already.
-        let _ = self.0.try_send(());
     }
 }
 

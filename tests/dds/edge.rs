@@ -366,7 +366,7 @@ fn readers_that_are_gone_are_not_announced_to_a_new_participant() {
     let present = here.create_reader("rt/present", TYPE, &qos).unwrap();
     // The thread of discovery removes them, perhaps only after the newcomer is there.
     std::thread::sleep(Duration::from_millis(300));
-    let newcomer = participant("newcomer", 81);
+    let mut newcomer = participant("newcomer", 81);
     let give_up = Instant::now() + Duration::from_secs(20);
     let mut announced = Vec::new();
     // SEDP announces readers in the order of their creation, so the present one comes last.
@@ -383,7 +383,7 @@ fn readers_that_are_gone_are_not_announced_to_a_new_participant() {
 
 #[test]
 fn a_change_that_discovery_reports_ends_the_wait_for_it() {
-    let here = participant("here", 63);
+    let mut here = participant("here", 63);
     let mut there = None;
     loop {
         let mut turn = DiscoveryTurn::default();

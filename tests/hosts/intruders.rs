@@ -59,7 +59,7 @@ fn read(node: &mut Participant, topic: &str) -> RawReader {
 }
 
 /// Adds the readers that a participant has discovered, by topic.
-fn take_in(participant: &Participant, readers: &mut BTreeMap<String, Endpoint>) {
+fn take_in(participant: &mut Participant, readers: &mut BTreeMap<String, Endpoint>) {
     while let Some(change) = participant.poll_discovery(&mut DiscoveryTurn::default()) {
         if let Discovery::Reader(reader) = change
             && !participant.owns(reader.guid)
@@ -73,7 +73,7 @@ fn take_in(participant: &Participant, readers: &mut BTreeMap<String, Endpoint>) 
 fn readers_of_every_library_are_matched_to_their_host() {
     let test = "readers_of_every_library_are_matched_to_their_host";
     let Some((_net, robot, laptop)) = robot_and_laptop(test) else { return };
-    let bridge = node_on(&robot, "bridge", 16);
+    let mut bridge = node_on(&robot, "bridge", 16);
     let mut peers = Vec::new();
     let mut nodes = Vec::new();
     let mut expected = BTreeMap::new();
@@ -101,7 +101,7 @@ fn readers_of_every_library_are_matched_to_their_host() {
 
     let mut readers = BTreeMap::new();
     support::wait_until("all readers discovered", || {
-        take_in(&bridge, &mut readers);
+        take_in(&mut bridge, &mut readers);
         expected.keys().all(|topic| readers.contains_key(topic))
     });
     let own = robot.within(|| host_addresses().unwrap());

@@ -353,6 +353,7 @@ impl Egress {
                 gone.push(change);
             }
         }
+        gone.extend(self.participant.find_missed(now));
         for output in &mut self.outputs {
             output.housekeeping(&mut self.participant, now);
             // After housekeeping, which may have recorded a reader that is already gone as unmatched.

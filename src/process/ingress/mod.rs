@@ -208,21 +208,11 @@ impl Ingress {
         let mut turn = DiscoveryTurn::default();
         while let Some(change) = self.participant.poll_discovery(&mut turn) {
             discovery_changed = true;
-            match change {
-                Discovery::Writer(writer) if !self.participant.owns(writer.guid) => {
-                    self.patterns.writer_found(&writer);
-                    self.for_each_input(|input, _| input.writer_found(&writer));
-                }
-                Discovery::WriterGone(guid) => {
-                    self.patterns.writers_gone(|writer| writer == guid);
-                    self.for_each_input(|input, _| input.writer_gone(guid));
-                }
-                Discovery::ParticipantGone { prefix, .. } => {
-                    self.patterns.writers_gone(|writer| writer.prefix() == prefix);
-                    self.for_each_input(|input, _| input.participant_gone(prefix));
-                }
-                _ => {}
-            }
+            self.apply(change);
+        }
+        for change in self.participant.find_missed(now) {
+            discovery_changed = true;
+            self.apply(change);
         }
         self.bind_places(now);
         // A topic of a pattern may appear at any time.
@@ -263,6 +253,25 @@ impl Ingress {
         let interval_ms = if self.hold_until.is_some() { HOLD_POLL_MS } else { HOUSEKEEPING_MS };
         self.housekeeping_at = now.plus_ms(interval_ms);
         outcome
+    }
+
+    /// Applies a change of discovery.
+    fn apply(&mut self, change: Discovery) {
+        match change {
+            Discovery::Writer(writer) if !self.participant.owns(writer.guid) => {
+                self.patterns.writer_found(&writer);
+                self.for_each_input(|input, _| input.writer_found(&writer));
+            }
+            Discovery::WriterGone(guid) => {
+                self.patterns.writers_gone(|writer| writer == guid);
+                self.for_each_input(|input, _| input.writer_gone(guid));
+            }
+            Discovery::ParticipantGone { prefix, .. } => {
+                self.patterns.writers_gone(|writer| writer.prefix() == prefix);
+                self.for_each_input(|input, _| input.participant_gone(prefix));
+            }
+            _ => {}
+        }
     }
 
     /// Returns the topics of the former process to their places.

@@ -849,6 +849,33 @@ impl DomainParticipant {
     self.dpi.lock().unwrap().discovered_writers()
   }
 
+  /// The events of all discovered Readers and Writers for which `is_known` returns false. It is called for each of
+  /// them, while discovery waits. [`EndpointDescription::seen_from`](crate::EndpointDescription::seen_from) is not
+  /// known.
+  pub fn discovered_besides(
+    &self,
+    mut is_known: impl FnMut(GUID) -> bool,
+  ) -> Vec<DomainParticipantStatusEvent> {
+    let db = self.discovery_db();
+    let db = db.read().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let readers = db
+      .get_all_external_topic_readers()
+      .map(|reader| (reader.reader_proxy.remote_reader_guid, reader));
+    let writers = db
+      .get_all_external_topic_writers()
+      .map(|writer| (writer.writer_proxy.remote_writer_guid, writer));
+    let mut events = Vec::new();
+    for (_, reader) in readers.filter(|(guid, _)| !is_known(*guid)) {
+      let reader = reader.describe(None);
+      events.push(DomainParticipantStatusEvent::ReaderDetected { reader });
+    }
+    for (_, writer) in writers.filter(|(guid, _)| !is_known(*guid)) {
+      let writer = writer.describe(None);
+      events.push(DomainParticipantStatusEvent::WriterDetected { writer });
+    }
+    events
+  }
+
   /// Manually asserts liveliness, affecting all writers with
   /// LIVELINESS QoS of MANUAL_BY_PARTICIPANT created by
   /// this particular participant.
@@ -990,7 +1017,16 @@ pub struct DomainParticipantStatusListener {
   dp_disc: Arc<Mutex<DomainParticipantDisc>>,
 }
 
-impl DomainParticipantStatusListener {}
+impl DomainParticipantStatusListener {
+  /// Whether an event was lost since the last call, because 2,048 others had not been taken.
+  /// [`DomainParticipant::discovered_besides`] tells what there is.
+  pub fn has_missed_events(&self) -> bool {
+    match self.dp_disc.lock() {
+      Ok(disc) => disc.status_channel_receiver().take_missed(),
+      Err(_) => false,
+    }
+  }
+}
 
 impl<'a> StatusEvented<'a, DomainParticipantStatusEvent, DomainParticipantStatusStream<'a>>
   for DomainParticipantStatusListener

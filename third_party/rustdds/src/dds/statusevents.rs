@@ -71,8 +71,10 @@ pub(crate) fn sync_status_channel<T>(
   #[cfg(feature = "mio_06")]
   let (legacy_sender, legacy_receiver) = mio_channel::sync_channel(capacity);
   let waker = Arc::new(Mutex::new(None));
+  let has_missed = Arc::new(AtomicBool::new(false));
   Ok((
     StatusChannelSender {
+      has_missed: Arc::clone(&has_missed),
       actual_sender,
       signal_sender,
       #[cfg(feature = "mio_06")]
@@ -80,6 +82,7 @@ pub(crate) fn sync_status_channel<T>(
       waker: Arc::clone(&waker),
     },
     StatusChannelReceiver {
+      has_missed,
       actual_receiver: Mutex::new(actual_receiver),
       signal_receiver,
       #[cfg(feature = "mio_06")]
@@ -97,6 +100,7 @@ pub struct StatusChannelSender<T> {
   #[cfg(feature = "mio_06")]
   legacy_sender: mio_channel::SyncSender<()>,
   waker: Arc<Mutex<Option<Waker>>>,
+  has_missed: Arc<AtomicBool>,
 }
 
 pub struct StatusChannelReceiver<T> {
@@ -105,6 +109,7 @@ pub struct StatusChannelReceiver<T> {
   #[cfg(feature = "mio_06")]
   legacy_receiver: Mutex<mio_channel::Receiver<()>>,
   waker: Arc<Mutex<Option<Waker>>>,
+  has_missed: Arc<AtomicBool>,
 }
 
 impl<T> StatusChannelSender<T> {
@@ -144,6 +149,7 @@ impl<T> StatusChannelSender<T> {
         // to `warn!` (as commit 724950ca briefly did) spams production logs
         // unstoppably.
         trace!("StatusChannelSender cannot send new status changes, channel is full.");
+        self.has_missed.store(true, Ordering::Release);
         // It is perfectly normal to fail due to full channel, because
         // no-one is required to be listening to these.
         self.signal_sender.send(); // kick the receiver anyway
@@ -161,6 +167,11 @@ impl<T> StatusChannelSender<T> {
 }
 
 impl<T> StatusChannelReceiver<T> {
+  // Whether an event did not fit since the last call.
+  pub(crate) fn take_missed(&self) -> bool {
+    self.has_missed.swap(false, Ordering::AcqRel)
+  }
+
   pub fn try_recv(&self) -> Result<T, std::sync::mpsc::TryRecvError> {
     // We do not manipulate waker here, because the
     // synchronous and asynchronous receiving are not supposed to be mixed.

@@ -1,4 +1,4 @@
-use std::{collections::BTreeMap, time::Instant};
+use std::{collections::BTreeMap, net::SocketAddr, time::Instant};
 
 use serde::{Deserialize, Serialize};
 #[allow(unused_imports)]
@@ -21,6 +21,7 @@ use crate::{
       },
       HasQoSPolicy, QosPolicies,
     },
+    statusevents::EndpointDescription,
     topic::{Topic, TopicDescription},
     with_key::datawriter::DataWriter,
   },
@@ -335,6 +336,19 @@ pub struct DiscoveredReaderData {
 }
 
 impl DiscoveredReaderData {
+  pub(crate) fn describe(&self, seen_from: Option<SocketAddr>) -> EndpointDescription {
+    EndpointDescription {
+      updated_time: Utc::now(),
+      guid: self.reader_proxy.remote_reader_guid,
+      topic_name: self.subscription_topic_data.topic_name.clone(),
+      type_name: self.subscription_topic_data.type_name().clone(),
+      qos: self.subscription_topic_data.qos(),
+      user_data: self.user_data.clone(),
+      unicast_addresses: udp_addresses(&self.reader_proxy.unicast_locator_list),
+      seen_from,
+    }
+  }
+
   // This is for generating test data only
   #[cfg(test)]
   pub fn default(topic_name: String, type_name: String) -> Self {
@@ -355,6 +369,14 @@ impl DiscoveredReaderData {
       user_data: Vec::new(),
     }
   }
+}
+
+fn udp_addresses(locators: &[Locator]) -> Vec<SocketAddr> {
+  locators
+    .iter()
+    .filter(|locator| locator.is_udp())
+    .map(|locator| SocketAddr::from(*locator))
+    .collect()
 }
 
 impl Keyed for DiscoveredReaderData {
@@ -805,6 +827,19 @@ impl Keyed for DiscoveredWriterData {
 }
 
 impl DiscoveredWriterData {
+  pub(crate) fn describe(&self, seen_from: Option<SocketAddr>) -> EndpointDescription {
+    EndpointDescription {
+      updated_time: Utc::now(),
+      guid: self.writer_proxy.remote_writer_guid,
+      topic_name: self.publication_topic_data.topic_name.clone(),
+      type_name: self.publication_topic_data.type_name.clone(),
+      qos: self.publication_topic_data.qos(),
+      user_data: self.user_data.clone(),
+      unicast_addresses: udp_addresses(&self.writer_proxy.unicast_locator_list),
+      seen_from,
+    }
+  }
+
   pub fn new<D: Keyed, SA: SerializerAdapter<D>>(
     writer: &DataWriter<D, SA>,
     topic: &Topic,

@@ -7,7 +7,6 @@ use std::{
   time::{Duration, Instant},
 };
 
-use chrono::Utc;
 use log::{debug, error, info, trace, warn};
 use mio1::{Events, Interest, Poll, Token};
 
@@ -51,11 +50,9 @@ use crate::{
     dds_cache::DDSCache,
     entity::RTPSEntity,
     guid::{EntityId, EntityKind, GuidPrefix, TokenDecode, GUID},
-    locator::Locator,
   },
   //QosPolicyBuilder,
   //QosPolicies,
-  EndpointDescription,
 };
 #[cfg(feature = "security")]
 use crate::{
@@ -1183,16 +1180,7 @@ impl DPEventLoop {
     self
       .participant_status_sender
       .try_send(DomainParticipantStatusEvent::ReaderDetected {
-        reader: EndpointDescription {
-          updated_time: Utc::now(),
-          guid: remote_reader.reader_proxy.remote_reader_guid,
-          topic_name: remote_reader.subscription_topic_data.topic_name.clone(),
-          type_name: remote_reader.subscription_topic_data.type_name().clone(),
-          qos: remote_reader.subscription_topic_data.qos(),
-          user_data: remote_reader.user_data.clone(),
-          unicast_addresses: udp_addresses(&remote_reader.reader_proxy.unicast_locator_list),
-          seen_from: self.seen_from(remote_reader.reader_proxy.remote_reader_guid),
-        },
+        reader: remote_reader.describe(self.seen_from(remote_reader.reader_proxy.remote_reader_guid)),
       })
       .unwrap_or_else(|e| error!("Cannot report participant status: {e:?}"));
 
@@ -1281,16 +1269,7 @@ impl DPEventLoop {
     self
       .participant_status_sender
       .try_send(DomainParticipantStatusEvent::WriterDetected {
-        writer: EndpointDescription {
-          updated_time: Utc::now(),
-          guid: remote_writer.writer_proxy.remote_writer_guid,
-          topic_name: remote_writer.publication_topic_data.topic_name.clone(),
-          type_name: remote_writer.publication_topic_data.type_name.clone(),
-          qos: remote_writer.publication_topic_data.qos(),
-          user_data: remote_writer.user_data.clone(),
-          unicast_addresses: udp_addresses(&remote_writer.writer_proxy.unicast_locator_list),
-          seen_from: self.seen_from(remote_writer.writer_proxy.remote_writer_guid),
-        },
+        writer: remote_writer.describe(self.seen_from(remote_writer.writer_proxy.remote_writer_guid)),
       })
       .unwrap_or_else(|e| error!("Cannot report participant status: {e:?}"));
 
@@ -1533,14 +1512,6 @@ impl DPEventLoop {
 // one would not understand the other's changes of instances.
 fn have_the_same_topic_kind(one: EntityKind, other: EntityKind) -> bool {
   one.is_with_key() == other.is_with_key()
-}
-
-fn udp_addresses(locators: &[Locator]) -> Vec<SocketAddr> {
-  locators
-    .iter()
-    .filter(|locator| locator.is_udp())
-    .map(|locator| SocketAddr::from(*locator))
-    .collect()
 }
 
 #[cfg(feature = "security")]
