@@ -2327,6 +2327,48 @@ mod tests {
     }
   }
 
+  // The event loop is in a hook of the application when discovery ends.
+  #[test]
+  fn the_goodbye_of_a_busy_participant_is_sent() {
+    use crate::dds::statusevents::{DomainParticipantStatusEvent, LostReason, StatusEvented};
+
+    let domain = test_domain_id(42);
+    let other = DomainParticipant::new(domain).unwrap();
+    let events = other.status_listener();
+    let is_busy = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
+    let busy = is_busy.clone();
+    let participant = DomainParticipantBuilder::new(domain)
+      .on_received(move || {
+        if busy.load(std::sync::atomic::Ordering::Relaxed) {
+          std::thread::sleep(std::time::Duration::from_millis(500));
+        }
+        false
+      })
+      .build()
+      .unwrap();
+    let prefix = participant.guid().prefix;
+    let wait = |is_wanted: &dyn Fn(&DomainParticipantStatusEvent) -> bool| {
+      for _ in 0..500 {
+        while let Some(event) = events.try_recv_status() {
+          if is_wanted(&event) {
+            return true;
+          }
+        }
+        std::thread::sleep(std::time::Duration::from_millis(10));
+      }
+      false
+    };
+    assert!(wait(&|event| matches!(event,
+      DomainParticipantStatusEvent::ParticipantDiscovered { dpd } if dpd.guid.prefix == prefix)));
+    is_busy.store(true, std::sync::atomic::Ordering::Relaxed);
+    participant.wake_event_loop();
+    std::thread::sleep(std::time::Duration::from_millis(50));
+    drop(participant);
+    // Without it the other one waits for the end of the lease.
+    assert!(wait(&|event| matches!(event,
+      DomainParticipantStatusEvent::ParticipantLost { id, reason: LostReason::Disposed } if *id == prefix)));
+  }
+
   // The discovery thread has a handle for a moment, for example while it announces the participant, and may
   // not be the one that drops the last.
   #[test]

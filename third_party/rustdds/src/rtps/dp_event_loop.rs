@@ -544,6 +544,8 @@ impl DPEventLoop {
     preparing_to_stop: &mut bool,
   ) -> bool {
     use std::sync::mpsc::TryRecvError;
+    // Not before the queues below are handled: the goodbye of discovery is in them.
+    let mut is_stopping = false;
     loop {
       match self.stop_poll_receiver.try_recv() {
         Ok(EventLoopCommand::PrepareStop) => {
@@ -552,7 +554,7 @@ impl DPEventLoop {
         }
         Ok(EventLoopCommand::Stop) => {
           info!("Stopping dp_event_loop");
-          return true;
+          is_stopping = true;
         }
         Ok(EventLoopCommand::ReceiveUserTraffic) => self.receive_user_traffic(),
         Err(TryRecvError::Empty) => break,
@@ -654,7 +656,10 @@ impl DPEventLoop {
       }
       self.message_receiver.notify_data_to_readers(local_readers);
     }
-    false
+    if is_stopping {
+      self.service_outbound();
+    }
+    is_stopping
   }
 
   fn drain_timers(&mut self, preparing_to_stop: bool) {
@@ -1427,7 +1432,9 @@ impl DPEventLoop {
   }
 
   fn remove_local_writer(&mut self, writer_guid: &GUID) {
-    if self.writers.remove(&writer_guid.entity_id).is_some() {
+    if let Some(mut writer) = self.writers.remove(&writer_guid.entity_id) {
+      // It may have rung for its last sample, such as a goodbye, after the doorbells were read.
+      writer.process_pending();
       // The timer is shared and stays with the loop. Stale timeouts are ignored
       // on dispatch (lookup miss).
 
