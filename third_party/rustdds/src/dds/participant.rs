@@ -1524,8 +1524,8 @@ impl Drop for DiscoveryThread {
   fn drop(&mut self) {
     info!("===== RustDDS shutting down ===== .drop() DiscoveryThread");
 
-    // Unlocked before the join: the thread may be about to lock it.
-    let handle = {
+    // Unlocked before it waits: the thread may be about to lock it, and its queue may be full.
+    let (commands, handle) = {
       let disc = self.dpi.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
       debug!("Wan dp_event_loop about stop.");
       if disc
@@ -1536,18 +1536,15 @@ impl Drop for DiscoveryThread {
       {
         error!("dp_event_loop not responding to prepare stop discovery_command");
       }
-
-      debug!("Sending Discovery Stop signal.");
-      if disc
-        .discovery_command_sender
-        .send(DiscoveryCommand::StopDiscovery)
-        .is_err()
-      {
-        warn!("Failed to send stop signal to Discovery");
-        return;
-      }
-      disc.discovery_join_handle.try_recv()
+      let handle = disc.discovery_join_handle.try_recv();
+      (disc.discovery_command_sender.clone(), handle)
     };
+
+    debug!("Sending Discovery Stop signal.");
+    if commands.send(DiscoveryCommand::StopDiscovery).is_err() {
+      warn!("Failed to send stop signal to Discovery");
+      return;
+    }
 
     debug!("Waiting for Discovery join.");
     if let Ok(handle) = handle {
