@@ -224,12 +224,25 @@ impl Identity {
     }
 
     /// How the process ends now that it was asked to.
-    pub fn leave(&mut self, now: MonotonicNs) -> Leave {
-        match self.successor.as_mut().filter(|_| self.is_kept).map(|successor| successor.leave(now)) {
-            // The next process may not continue one that is not proven.
-            Some(Leave::HandOver) if now < self.proven_at => Leave::Soon,
-            leave => leave.unwrap_or(Leave::ForGood),
+    pub fn leave(&mut self, participant: &Participant, now: MonotonicNs) -> Leave {
+        let Some(successor) = self.successor.as_mut().filter(|_| self.is_kept) else { return Leave::ForGood };
+        let leave = successor.leave(now);
+        if leave == Leave::ForGood {
+            return leave;
         }
+        // The next process may not continue one that is not proven, which housekeeping puts on the board.
+        if now < self.proven_at || self.board.get().unproven > 0 {
+            let gives_up = now >= self.proven_at.plus_ms(PROVEN_AFTER_MS);
+            return if gives_up { Leave::ForGood } else { Leave::Soon };
+        }
+        if leave == Leave::Soon {
+            return leave;
+        }
+        // With what discovery has found since the last housekeeping.
+        if let Err(error) = self.journal.write(participant.guid(), &participant.discovery_journal()) {
+            warn!(%error, "cannot write the journal of discovery; others match the standby anew");
+        }
+        if successor.hand_over() { Leave::HandOver } else { Leave::ForGood }
     }
 
     /// The next process does not continue this one, which says goodbye.

@@ -244,7 +244,8 @@ impl Waiting {
             }
             self.ended_at = clock::monotonic();
             let end_ms = if is_stopping { LAST_END_MS } else { END_MS };
-            let try_until = if was_connected { self.ended_at.plus_ms(end_ms) } else { self.ended_at };
+            let ends_now = was_connected || self.cause == TakeOverCause::HandedOver;
+            let try_until = if ends_now { self.ended_at.plus_ms(end_ms) } else { self.ended_at };
             let Some(lock) = self.take(settings, name, try_until)? else {
                 if is_stopping {
                     break;
@@ -312,12 +313,18 @@ impl Waiting {
 
     /// Tells the active process that this one takes nothing over any more; false if it has handed over.
     fn has_declined(&mut self) -> bool {
-        if let Some(active) = &self.active {
-            decline(&active.connection);
-        }
-        while let Some(active) = &self.active {
-            let request = kept_sockets::receive(&active.connection);
-            self.heed(request);
+        decline(&self.listener);
+        loop {
+            if let Some(active) = &self.active {
+                decline(&active.connection);
+            }
+            while let Some(active) = &self.active {
+                let request = kept_sockets::receive(&active.connection);
+                self.heed(request);
+            }
+            // A connection that it has not accepted yet.
+            let Ok((connection, _)) = self.listener.accept() else { break };
+            self.active = Active::of(connection.into()).ok();
         }
         self.cause != TakeOverCause::HandedOver
     }

@@ -90,7 +90,7 @@ impl Successor {
         Self { path, address: None, sockets, connection: None, leave_at: None }
     }
 
-    /// How the process ends now that it was asked to.
+    /// How the process can end now that it was asked to.
     pub fn leave(&mut self, now: MonotonicNs) -> Leave {
         // It may have started since the last housekeeping.
         self.housekeeping();
@@ -99,19 +99,22 @@ impl Successor {
             return Leave::ForGood;
         }
         let leave_at = *self.leave_at.get_or_insert(now.plus_ms(LEAVE_MS));
-        if now < leave_at {
-            return Leave::Soon;
-        }
-        match &self.connection {
-            Some(connection) if kept_sockets::say_stopping(connection.as_fd()).is_ok() => Leave::HandOver,
-            _ => Leave::ForGood,
-        }
+        if now < leave_at { Leave::Soon } else { Leave::HandOver }
+    }
+
+    /// Tells the standby to take over. False if it does not: it has ended, or is about to.
+    pub fn hand_over(&self) -> bool {
+        self.connection
+            .as_ref()
+            .is_some_and(|connection| kept_sockets::say_stopping(connection.as_fd()).is_ok())
     }
 
     /// Connects to a standby that has none of the sockets. Never waits; some 5 µs without a standby.
     pub fn housekeeping(&mut self) {
         if self.connection.as_ref().is_some_and(has_ended) {
             self.connection = None;
+            // The next standby may end as well.
+            self.leave_at = None;
         }
         if self.connection.is_some() || self.sockets.is_empty() {
             return;
@@ -144,10 +147,11 @@ impl Successor {
     }
 }
 
-/// Makes the messages that the active process sends from now on fail. Those before can still be received.
-pub(super) fn decline(connection: &OwnedFd) {
+/// Makes what the active process sends to a socket from now on fail, messages or attempts to connect. Those
+/// before can still be received.
+pub(super) fn decline(socket: &impl AsRawFd) {
     // Fails only if the connection has ended.
-    let _ = shutdown(connection.as_raw_fd(), Shutdown::Read);
+    let _ = shutdown(socket.as_raw_fd(), Shutdown::Read);
 }
 
 /// Whether SIGSTOP has stopped the process that listens at the other end of a connection, as far as this one
@@ -189,6 +193,7 @@ mod tests {
         let (connection, _) = standby.accept().unwrap();
         assert_eq!(active.leave(at(1_000 + LEAVE_MS - 1)), Leave::Soon);
         assert_eq!(active.leave(at(1_000 + LEAVE_MS)), Leave::HandOver);
+        assert!(active.hand_over());
         let received = || kept_sockets::receive(&connection);
         assert!(matches!(received(), Some(Request::Store(sockets)) if sockets.len() == 1));
         assert!(matches!(received(), Some(Request::Stopping)));
@@ -204,18 +209,32 @@ mod tests {
             let standby = listen_at(&path).unwrap();
             let mut active = Successor::new(path, vec![UdpSocket::bind("127.0.0.1:0").unwrap()]);
             assert_eq!(active.leave(at(0)), Leave::Soon);
-            let connection = standby.accept().unwrap().0.into();
-            let mut leaves = || active.leave(at(LEAVE_MS));
-            let left = hands_over_first.then(&mut leaves);
+            let connection: OwnedFd = standby.accept().unwrap().0.into();
+            assert_eq!(active.leave(at(LEAVE_MS)), Leave::HandOver);
+            let handed_over = hands_over_first.then(|| active.hand_over());
             decline(&connection);
-            let left = left.unwrap_or_else(leaves);
-            assert_eq!(left, if hands_over_first { Leave::HandOver } else { Leave::ForGood });
+            assert_eq!(handed_over.unwrap_or_else(|| active.hand_over()), hands_over_first);
             assert!(matches!(kept_sockets::receive(&connection), Some(Request::Store(_))));
             let last = kept_sockets::receive(&connection);
             assert_eq!(matches!(last, Some(Request::Stopping)), hands_over_first);
             let end = kept_sockets::receive(&connection);
             assert!(matches!(end, Some(Request::Unknown) | None));
         }
+    }
+
+    #[test]
+    fn a_process_gives_each_standby_the_time_to_end_as_well() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("standby");
+        let mut active = Successor::new(path.clone(), vec![UdpSocket::bind("127.0.0.1:0").unwrap()]);
+        let standby = listen_at(&path).unwrap();
+        assert_eq!(active.leave(at(0)), Leave::Soon);
+        drop(standby.accept().unwrap());
+        // It connects to one whose connection has ended, and that still listens.
+        assert_eq!(active.leave(at(LEAVE_MS)), Leave::Soon);
+        decline(&standby);
+        drop(standby.accept().unwrap());
+        assert_eq!(active.leave(at(2 * LEAVE_MS)), Leave::ForGood, "it listens no more");
     }
 
     #[test]

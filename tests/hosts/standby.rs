@@ -166,6 +166,35 @@ fn take_over(test: &str, events: &[(&str, Event)], publisher: Peer) {
 }
 
 #[test]
+fn a_standby_that_is_asked_to_end_right_after_it_took_over_hands_over_too() {
+    let test = "a_standby_that_is_asked_to_end_right_after_it_took_over_hands_over_too";
+    let _alone = support::exclusive();
+    let Some(bed) = Bed::start(test, &format!("{SCAN}{STANDBYS}")) else { return };
+    let subscriber = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(RATE_HZ), INPUT);
+    subscriber.wait_received(100);
+    let mut active = wait_standby(&bed, LANE);
+    for take_overs in 1..=3 {
+        signal(active, Signal::SIGTERM);
+        let status =
+            bed.bridge.wait_status(&format!("take-over {take_overs}, and the next standby"), |status| {
+                let lane = process(status, LANE);
+                lane["standby"]["take_overs"] == take_overs && lane["standby"]["pid"] != 0
+            });
+        let lane = process(&status, LANE);
+        assert_eq!(lane["standby"]["cause"], "handed_over", "{lane}");
+        active = i32::try_from(number(&lane["pid"])).unwrap();
+    }
+    subscriber.wait_received(subscriber.received() + 200);
+    let sent: Sent = publisher.end();
+    bed.wait_accounted();
+    let received = end("Cyclone DDS", subscriber, &sent);
+    received.assert_sound();
+    assert_eq!(received.missing_count, 0, "{received:?}");
+    bed.end();
+}
+
+#[test]
 fn a_bridge_with_standbys_that_ends_says_goodbye() {
     let test = "a_bridge_with_standbys_that_ends_says_goodbye";
     let Some(mut bed) = Bed::start(test, &format!("{SCAN}{STANDBYS}")) else { return };

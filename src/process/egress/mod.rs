@@ -409,7 +409,8 @@ impl Egress {
 
     fn leave(&mut self) -> Leave {
         let now = clock::monotonic();
-        self.identity.as_mut().map_or(Leave::ForGood, |identity| identity.leave(now))
+        let leave = |identity: &mut Identity| identity.leave(&self.participant, now);
+        self.identity.as_mut().map_or(Leave::ForGood, leave)
     }
 
     /// Forwards the samples that still wait, as far as the lane's mode allows, and accounts for the rest.

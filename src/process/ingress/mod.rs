@@ -82,7 +82,7 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
     info!(routes = settings.routes.len(), domain_id = settings.input.domain_id, "ingress is up");
     let leave = loop {
         if stop.is_requested() {
-            match ingress.identity.leave(clock::monotonic()) {
+            match ingress.identity.leave(&ingress.participant, clock::monotonic()) {
                 Leave::Soon => {}
                 leave => break leave,
             }
@@ -100,6 +100,8 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
         return Ok(());
     }
     ingress.identity.end();
+    // Nobody else says goodbye for a killed former process.
+    ingress.role.dispose_former(&ingress.participant);
     // Publishes the samples that DDS has received by now. The time limit is for publishers that keep sending.
     let give_up_at = clock::monotonic().plus_ms(LAST_SAMPLES_MS);
     while ingress.receiving.turn(false) && clock::monotonic() < give_up_at {}
