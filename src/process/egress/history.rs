@@ -6,7 +6,7 @@
 use bytes::Bytes;
 use tracing::warn;
 
-use super::late_joiners::{self, KeptSample, LateJoiners};
+use super::late_joiners::{self, KeptSample, LateJoiners, SAMPLES_PER_TURN};
 use crate::dds::RawWriter;
 use crate::model::{Guid, MAX_PUBLISHERS, MonotonicNs, PublisherAccount, SampleHeader};
 use crate::shm::Boards;
@@ -68,7 +68,8 @@ impl History {
     /// Sends the history to the late joiners that are due, and logs what it has lost.
     pub fn serve(&mut self, writer: &RawWriter, route: &str, lane: &str, now: MonotonicNs) {
         if let Some(late_joiners) = &mut self.late_joiners {
-            while let Some((reader, history)) = late_joiners.next_due(now) {
+            let mut left = SAMPLES_PER_TURN;
+            while let Some((reader, history)) = late_joiners.next_due(now, &mut left) {
                 for kept in history {
                     let payload = kept.payload.clone();
                     let written =

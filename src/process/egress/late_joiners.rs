@@ -19,6 +19,11 @@ const SETTLING_MS: u64 = 1_000;
 /// counts and logs.
 pub(super) const MAX_WAITING: usize = 4_096;
 
+/// The samples of histories that a lane sends in one turn of its housekeeping, ten times a second, or those
+/// of one reader. New samples wait meanwhile: 4,096 readers that join at once get 262,144 samples of 64
+/// publishers.
+pub(super) const SAMPLES_PER_TURN: usize = 256;
+
 /// The most bytes of samples of several publishers, here and in the history of a RELIABLE writer. The last
 /// `depth` samples are kept whatever their size.
 pub(super) const MAX_BYTES: usize = 32 << 20;
@@ -134,12 +139,14 @@ impl LateJoiners {
         self.waiting.retain(|(waiting, _)| *waiting != reader);
     }
 
-    /// Removes and returns the next reader that is due, with the history to send to it.
-    pub fn next_due(&mut self, now: MonotonicNs) -> Option<(Guid, &VecDeque<KeptSample>)> {
-        if self.waiting.front().is_none_or(|(_, at)| now < *at) {
+    /// Removes and returns the next reader that is due, with the history to send to it, unless the turn has
+    /// no samples left. `left` is their number, [`SAMPLES_PER_TURN`] at first.
+    pub fn next_due(&mut self, now: MonotonicNs, left: &mut usize) -> Option<(Guid, &VecDeque<KeptSample>)> {
+        if *left == 0 || self.waiting.front().is_none_or(|(_, at)| now < *at) {
             return None;
         }
         let (reader, _) = self.waiting.pop_front()?;
+        *left = left.saturating_sub(self.history.len());
         Some((reader, &self.history))
     }
 }
@@ -168,12 +175,29 @@ mod tests {
         let (reader, start) = (Guid([1; 16]), MonotonicNs(0));
         late.joined(reader, start);
         late.joined(reader, start);
-        assert!(late.next_due(start).is_none());
+        assert!(late.next_due(start, &mut { SAMPLES_PER_TURN }).is_none());
         let later = start.plus_ms(SETTLING_MS);
-        let (joiner, history) = late.next_due(later).unwrap();
+        let (joiner, history) = late.next_due(later, &mut { SAMPLES_PER_TURN }).unwrap();
         let bytes: Vec<u8> = history.iter().map(|sample| sample.payload[0]).collect();
         assert_eq!((joiner, bytes), (reader, vec![3, 4]));
-        assert!(late.next_due(later).is_none());
+        assert!(late.next_due(later, &mut { SAMPLES_PER_TURN }).is_none());
+    }
+
+    #[test]
+    fn readers_that_join_at_once_are_served_over_several_turns() {
+        let mut late = LateJoiners::new(100);
+        for byte in 0..100 {
+            late.keep(kept(byte));
+        }
+        for number in 0..7 {
+            late.joined(Guid([number; 16]), MonotonicNs(0));
+        }
+        let later = MonotonicNs(0).plus_ms(SETTLING_MS);
+        let mut served = || {
+            let mut left = SAMPLES_PER_TURN;
+            std::iter::from_fn(|| late.next_due(later, &mut left).map(|(_, history)| history.len())).count()
+        };
+        assert_eq!([served(), served(), served(), served()], [3, 3, 1, 0]);
     }
 
     fn history(late: &LateJoiners) -> Vec<u8> {
@@ -237,7 +261,7 @@ mod tests {
         let mut late = LateJoiners::new(1);
         late.joined(Guid([1; 16]), MonotonicNs(0));
         late.left(Guid([1; 16]));
-        assert!(late.next_due(MonotonicNs(u64::MAX)).is_none());
+        assert!(late.next_due(MonotonicNs(u64::MAX), &mut { SAMPLES_PER_TURN }).is_none());
         let reader = |number: usize| Guid((number as u128).to_be_bytes());
         for number in 0..MAX_WAITING {
             assert!(late.joined(reader(number), MonotonicNs(0)), "{number}");
@@ -245,8 +269,11 @@ mod tests {
         assert!(!late.joined(reader(MAX_WAITING), MonotonicNs(0)));
         assert!(late.joined(reader(7), MonotonicNs(0)), "it waits already");
         for number in 0..MAX_WAITING {
-            assert_eq!(late.next_due(MonotonicNs(u64::MAX)).unwrap().0, reader(number));
+            assert_eq!(
+                late.next_due(MonotonicNs(u64::MAX), &mut { SAMPLES_PER_TURN }).unwrap().0,
+                reader(number)
+            );
         }
-        assert!(late.next_due(MonotonicNs(u64::MAX)).is_none());
+        assert!(late.next_due(MonotonicNs(u64::MAX), &mut { SAMPLES_PER_TURN }).is_none());
     }
 }

@@ -17,7 +17,7 @@ fn a_best_effort_late_joiner_waits_for_the_history_until_it_leaves() {
     host.announce_type();
     let mut output = host.open();
     let due = |output: &mut Output| {
-        waiting(output).next_due(clock::monotonic().plus_ms(60_000)).map(|(reader, _)| reader)
+        waiting(output).next_due(clock::monotonic().plus_ms(60_000), &mut 1).map(|(reader, _)| reader)
     };
     let first = host.subscribe_with(Reliability::BestEffort, Durability::TransientLocal);
     wait_readers(&mut output, 1);
