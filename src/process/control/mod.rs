@@ -205,10 +205,12 @@ impl Control {
 
     fn receive(&mut self) {
         let Some(trust) = &mut self.trust else { return };
-        let mut budget = RESPONSES_PER_TURN;
+        let share = RESPONSES_PER_TURN / self.links.len().max(1);
         let (mut invalid, mut late, mut accepted) =
             (InvalidResponses::default(), RefusalCounts::default(), 0);
         for (number, link) in self.links.iter_mut().enumerate() {
+            // A flood on one network takes nothing from the others.
+            let mut budget = share;
             while let Some(response) = link.receive(trust, &mut invalid, &mut budget) {
                 match self.subscribers.on_response(number, link, &response, &self.settings) {
                     Ok(()) => accepted += 1,
