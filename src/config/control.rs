@@ -1,7 +1,7 @@
 //! Reads the sections of the control process: classifier, probes, safety, security, diagnostics, overrides
 //! and subscribers.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -10,7 +10,7 @@ use super::settings::{
     Classifier, ClassifierThresholds, Diagnostics, Lane, MetricsListener, Probes, Safety, SafetyRules,
     SecretSource, Security,
 };
-use crate::model::{LaneName, SubscriberState, TopicName, is_probe_id};
+use crate::model::{LaneName, MAX_SUBSCRIBERS, SubscriberState, TopicName, is_probe_id};
 
 pub(super) fn classifier(root: &Field<'_>) -> Classifier {
     let section = root.section("classifier");
@@ -217,6 +217,22 @@ pub(super) fn subscribers(root: &Field<'_>, lanes: &[Lane]) -> BTreeMap<String, 
     on_lanes.collect()
 }
 
+/// Checks that control has a place for each subscriber that the configuration names.
+pub(super) fn check_number_of_subscribers(root: &Field<'_>, classified: Option<&str>) {
+    let mut named: BTreeSet<&str> = classified.into_iter().collect();
+    for section in ["subscribers", "overrides"] {
+        for (id, field) in root.get(section).entries() {
+            if named.insert(id) && named.len() > MAX_SUBSCRIBERS {
+                field.report_key(&format!(
+                    "is one subscriber too many: `subscribers`, `overrides` and `classifier.subscriber_id` may \
+                     name {MAX_SUBSCRIBERS} in all"
+                ));
+                return;
+            }
+        }
+    }
+}
+
 /// Checks that a subscriber's id is valid in probe messages.
 fn check_id(id: &str, field: &Field<'_>) {
     if !is_probe_id(id) {
@@ -227,6 +243,7 @@ fn check_id(id: &str, field: &Field<'_>) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::load::parse;
     use crate::config::problem::Problems;
 
     #[test]
@@ -237,6 +254,24 @@ mod tests {
         assert_eq!(probes(&root, 20).response_topic.as_str(), "/adaptive_bridge/probe_resp");
         assert_eq!(diagnostics(&root).topic.as_str(), "/adaptive_bridge/diagnostics");
         assert!(problems.into_inner().is_empty());
+    }
+
+    #[test]
+    fn no_more_subscribers_may_be_named_than_control_has_places_for() {
+        let yaml = |listed: std::ops::Range<usize>| {
+            let lines = |state: &'static str| move |id: usize| format!("  s{id}: {state}\n");
+            let subscribers: String = listed.clone().map(lines("noncritical")).collect();
+            let overrides: String = listed.map(lines("UNKNOWN")).collect();
+            format!(
+                "topics: [{{id: scan, input_topic: /scan}}]\nclassifier: {{subscriber_id: s0}}\n\
+                 subscribers:\n{subscribers}overrides:\n{overrides}"
+            )
+        };
+        let problems = |yaml: &str| parse(yaml, "f.yaml", &|_| None).err().map(|error| error.to_string());
+        assert_eq!(problems(&yaml(0..64)), None);
+        let error = problems(&yaml(0..65)).unwrap();
+        assert!(error.contains("subscribers.s64") && error.contains("may name 64 in all"), "{error}");
+        assert!(problems(&yaml(1..65)).is_some());
     }
 
     #[test]

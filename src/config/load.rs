@@ -226,6 +226,8 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
         lanes::scheduling(&section, lanes::default_scheduling(class))
     };
     let security = control::security(root);
+    let classifier = control::classifier(root);
+    control::check_number_of_subscribers(root, classifier.subscriber_id.as_deref());
     let policy_hold_s = root.get("policy_hold_s").decimal_or_default();
     let ros = root.get("ros");
     let namespace = |text: &str| text == "/" || TopicName::try_from(text).is_ok();
@@ -250,7 +252,7 @@ fn settings(root: &Field<'_>, environment: &Environment) -> Settings {
         ingress_scheduling: process("ingress", Some(TrafficClass::Critical)),
         ingress_standby,
         control_scheduling: process("control", None),
-        classifier: control::classifier(root),
+        classifier,
         probes: control::probes(root, security.max_probe_rate_hz),
         safety,
         security,
