@@ -123,34 +123,48 @@ fn role(
     role: impl FnOnce(&Configuration, ReloadRequests, &Stop) -> Result<(), RoleError>,
 ) -> Result<ExitCode, ExitCode> {
     process::bound_free_memory();
+    // First: a signal that ends the process by itself would leave its files.
+    let stop = stop_on_signals()?;
     let reload_arguments = arguments.clone();
     let reloads = ReloadRequests::on_signal(move |set| reload_arguments.try_load_with(set))
         .map_err(|error| failed(&error))?;
     process::end_with_supervisor();
     let (file, load) = (arguments.file(), |set: &SetParameters| arguments.try_load_with(set));
-    let joined = if is_standby() { InForce::wait(&file, load) } else { InForce::join(&file, load) };
+    let joined =
+        if is_standby() { InForce::wait(&file, load, &stop) } else { InForce::join(&file, load).map(Some) };
     let in_force = match joined {
-        Ok(in_force) => in_force,
+        Ok(Some(in_force)) => in_force,
+        Ok(None) => return Ok(ExitCode::SUCCESS),
         Err(InForceError::Config(error)) => return Err(bad_configuration(&error)),
-        Err(error) => return run(|_| Err(error)),
+        Err(error) => return run_until(&stop, |_| Err(error)),
     };
     let configuration = in_force.configuration().clone();
     telemetry::set_verbosity(configuration.settings.diagnostics.verbosity);
-    run(|stop| role(&configuration, reloads.kept_in(in_force), stop))
+    run_until(&stop, |stop| role(&configuration, reloads.kept_in(in_force), stop))
 }
 
 /// Runs `role` until it returns or a signal stops it, and returns the exit code of the process.
 pub(super) fn run<E: std::fmt::Display>(
     role: impl FnOnce(&Stop) -> Result<(), E>,
 ) -> Result<ExitCode, ExitCode> {
+    run_until(&stop_on_signals()?, role)
+}
+
+fn stop_on_signals() -> Result<Stop, ExitCode> {
+    Stop::on_signals().map_err(|error| failed(&error))
+}
+
+fn run_until<E: std::fmt::Display>(
+    stop: &Stop,
+    role: impl FnOnce(&Stop) -> Result<(), E>,
+) -> Result<ExitCode, ExitCode> {
     process::abort_on_panic();
-    let stop = Stop::on_signals().map_err(|error| failed(&error))?;
-    match role(&stop) {
+    match role(stop) {
         Ok(()) => Ok(ExitCode::SUCCESS),
         Err(error) => {
             let code = failed(&error);
             if std::env::var_os("NOTIFY_SOCKET").is_some() {
-                pause(FAILED_START_MS, &stop);
+                pause(FAILED_START_MS, stop);
             }
             Err(code)
         }

@@ -7,6 +7,7 @@ use std::time::Duration;
 use tracing::{info, warn};
 
 use super::parameter_store::read_parameters;
+use super::stop::Stop;
 use crate::clock;
 use crate::config::{ConfigError, Configuration, SetParameters, Settings};
 use crate::model::InstanceName;
@@ -84,18 +85,23 @@ impl InForce {
     }
 
     /// Like [`join`](Self::join), for the service of a standby: waits for a bridge and begins none. With
-    /// another file than the service that it is to take over from, that would be a second bridge.
+    /// another file than the service that it is to take over from, that would be a second bridge. `None` if
+    /// `stop` was requested meanwhile.
     ///
     /// # Errors
     /// No bridge runs with `file` within 20 s, the file is bad, or the folder of the instance cannot be used.
     pub fn wait(
         file: &Path,
         load: impl Fn(&SetParameters) -> Result<Configuration, ConfigError>,
-    ) -> Result<Self, InForceError> {
+        stop: &Stop,
+    ) -> Result<Option<Self>, InForceError> {
         let give_up_at = clock::monotonic().plus_ms(BRIDGE_WITHIN_MS);
         loop {
             if let Some(joined) = Self::join_running(file, &load)? {
-                return Ok(joined);
+                return Ok(Some(joined));
+            }
+            if stop.is_requested() {
+                return Ok(None);
             }
             // With a bad file no other process begins a bridge either.
             load(&SetParameters::new())?;
