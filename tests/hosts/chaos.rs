@@ -179,7 +179,7 @@ mod long {
         subscriber.wait_received(subscriber.received() + 400);
 
         let sent: Sent = publisher.end();
-        assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+        sent.assert_not_blocked();
         let account_of = |status: &Value| {
             let accounts = status["routes"][0]["publishers"].as_array().unwrap();
             accounts.iter().max_by_key(|account| number(&account["received"])).unwrap().clone()
