@@ -2366,6 +2366,66 @@ mod tests {
       DomainParticipantStatusEvent::ParticipantLost { id, reason: LostReason::Disposed } if *id == prefix)));
   }
 
+  // The event loop is slow: discovery has read both announcements before it handles the first.
+  #[test]
+  fn a_writer_is_discovered_before_it_is_lost() {
+    use crate::dds::statusevents::{DomainParticipantStatusEvent, StatusEvented};
+
+    let domain = test_domain_id(41);
+    let is_slow = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
+    let slow = is_slow.clone();
+    let here = DomainParticipantBuilder::new(domain)
+      .on_received(move || {
+        if slow.load(std::sync::atomic::Ordering::Relaxed) {
+          std::thread::sleep(std::time::Duration::from_millis(100));
+        }
+        false
+      })
+      .build()
+      .unwrap();
+    let events = here.status_listener();
+    let there = DomainParticipant::new(domain).unwrap();
+    let qos = QosPolicies::qos_none();
+    let publisher = there.create_publisher(&qos).unwrap();
+    let topic = there.create_topic("t".to_string(), "T".to_string(), &qos, TopicKind::NoKey).unwrap();
+    let seen_of = |guid: GUID, last: &str| {
+      let mut seen = Vec::new();
+      let mut polls_left = 1_000;
+      while polls_left > 0 {
+        polls_left -= 1;
+        while let Some(event) = events.try_recv_status() {
+          match event {
+            DomainParticipantStatusEvent::WriterDetected { writer } if writer.guid == guid => {
+              seen.push("found");
+            }
+            DomainParticipantStatusEvent::WriterLost { guid: lost, .. } if lost == guid => {
+              seen.push("lost");
+            }
+            _ => (),
+          }
+        }
+        if seen.contains(&last) {
+          // What comes after it comes soon.
+          polls_left = polls_left.min(100);
+        }
+        std::thread::sleep(std::time::Duration::from_millis(10));
+      }
+      // An announcement may come twice.
+      seen.dedup();
+      seen
+    };
+    let first = publisher.create_datawriter_no_key_cdr::<u32>(&topic, None).unwrap();
+    assert_eq!(seen_of(first.guid(), "found"), ["found"]);
+    is_slow.store(true, std::sync::atomic::Ordering::Relaxed);
+    let second = publisher.create_datawriter_no_key_cdr::<u32>(&topic, None).unwrap();
+    let guid = second.guid();
+    // Announced, and in the hook of the other participant.
+    std::thread::sleep(std::time::Duration::from_millis(50));
+    drop(second);
+    assert_eq!(seen_of(guid, "lost"), ["found", "lost"]);
+    drop(first);
+  }
+
   // The discovery thread has a handle for a moment, for example while it announces the participant, and may
   // not be the one that drops the last.
   #[test]

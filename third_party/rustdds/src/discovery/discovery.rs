@@ -1518,19 +1518,11 @@ impl Discovery {
   fn reader_is_gone(&mut self, guid: GUID) {
     discovery_db_write(&self.discovery_db).remove_topic_reader(guid);
     self.send_discovery_notification(DiscoveryNotificationType::ReaderLost { reader_guid: guid });
-    self.send_participant_status(DomainParticipantStatusEvent::ReaderLost {
-      guid,
-      reason: LostReason::Disposed,
-    });
   }
 
   fn writer_is_gone(&mut self, guid: GUID) {
     discovery_db_write(&self.discovery_db).remove_topic_writer(guid);
     self.send_discovery_notification(DiscoveryNotificationType::WriterLost { writer_guid: guid });
-    self.send_participant_status(DomainParticipantStatusEvent::WriterLost {
-      guid,
-      reason: LostReason::Disposed,
-    });
   }
 
   fn process_participant_dispose(&mut self, participant_guidp: GuidPrefix) {
@@ -1549,15 +1541,12 @@ impl Discovery {
     }
   }
 
-  // Tells the event loop and the application of one that the database has removed.
+  // Tells the event loop of one that the database has removed. The event loop tells the application, as of all
+  // that is discovered or lost, so that the application hears of both in their order.
   fn participant_is_gone(&mut self, participant_guidp: GuidPrefix) {
     self.silent.retain(|(silent, _)| *silent != participant_guidp);
     self.send_discovery_notification(DiscoveryNotificationType::ParticipantLost {
       guid_prefix: participant_guidp,
-      is_silent: false,
-    });
-    self.send_participant_status(DomainParticipantStatusEvent::ParticipantLost {
-      id: participant_guidp,
       reason: LostReason::Disposed,
     });
     #[cfg(feature = "security")]
@@ -2175,10 +2164,6 @@ impl Discovery {
             info!("Secure Dispose Reader {reader_guid:?}");
             discovery_db_write(&self.discovery_db).remove_topic_reader(reader_guid);
             self.send_discovery_notification(DiscoveryNotificationType::ReaderLost { reader_guid });
-            self.send_participant_status(DomainParticipantStatusEvent::ReaderLost {
-              guid: reader_guid,
-              reason: LostReason::Disposed,
-            });
           }
         }
       }
@@ -2224,10 +2209,6 @@ impl Discovery {
             info!("Secure Dispose Writer {writer_guid:?}");
             discovery_db_write(&self.discovery_db).remove_topic_writer(writer_guid);
             self.send_discovery_notification(DiscoveryNotificationType::WriterLost { writer_guid });
-            self.send_participant_status(DomainParticipantStatusEvent::WriterLost {
-              guid: writer_guid,
-              reason: LostReason::Disposed,
-            });
           }
         }
       }
@@ -2253,13 +2234,9 @@ impl Discovery {
       debug!("participant cleanup - timeout for {guid_prefix:?}");
       self.send_discovery_notification(DiscoveryNotificationType::ParticipantLost {
         guid_prefix,
-        is_silent: true,
-      });
-      self.silent.push((guid_prefix, std::time::Instant::now()));
-      self.send_participant_status(DomainParticipantStatusEvent::ParticipantLost {
-        id: guid_prefix,
         reason,
       });
+      self.silent.push((guid_prefix, std::time::Instant::now()));
     }
   }
 

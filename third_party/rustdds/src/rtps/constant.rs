@@ -3,6 +3,7 @@ use std::time::Duration;
 use mio1::Token;
 
 use crate::{
+  dds::statusevents::LostReason,
   discovery::{
     builtin_endpoint::BuiltinEndpointSet,
     discovery::Discovery,
@@ -625,9 +626,9 @@ pub(crate) enum DiscoveryNotificationType {
   },
   ParticipantLost {
     guid_prefix: GuidPrefix,
-    /// Its lease has ended without a goodbye: announcements to it go on until
+    /// If its lease has ended without a goodbye, announcements to it go on until
     /// `ParticipantForgotten`.
-    is_silent: bool,
+    reason: LostReason,
   },
   ParticipantForgotten {
     guid_prefix: GuidPrefix,

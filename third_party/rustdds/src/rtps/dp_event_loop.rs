@@ -14,7 +14,7 @@ use crate::{
   dds::{
     qos::policy,
     result::{CreateError, CreateResult},
-    statusevents::{DomainParticipantStatusEvent, StatusChannelSender},
+    statusevents::{DomainParticipantStatusEvent, LostReason, StatusChannelSender},
   },
   discovery::{
     discovery::DiscoveryCommand,
@@ -582,11 +582,23 @@ impl DPEventLoop {
         WriterUpdated {
           discovered_writer_data,
         } => self.remote_writer_discovered(&discovered_writer_data),
-        WriterLost { writer_guid } => self.remote_writer_lost(writer_guid),
+        WriterLost { writer_guid } => {
+          self.remote_writer_lost(writer_guid);
+          self.send_participant_status(DomainParticipantStatusEvent::WriterLost {
+            guid: writer_guid,
+            reason: LostReason::Disposed,
+          });
+        }
         ReaderUpdated {
           discovered_reader_data,
         } => self.remote_reader_discovered(&discovered_reader_data),
-        ReaderLost { reader_guid } => self.remote_reader_lost(reader_guid),
+        ReaderLost { reader_guid } => {
+          self.remote_reader_lost(reader_guid);
+          self.send_participant_status(DomainParticipantStatusEvent::ReaderLost {
+            guid: reader_guid,
+            reason: LostReason::Disposed,
+          });
+        }
         ParticipantUpdated { guid_prefix } => {
           // A HEARTBEAT of each built-in writer, and an ACKNACK of each built-in reader
           // to each of its addresses: sixteen datagrams with three interfaces.
@@ -600,8 +612,15 @@ impl DPEventLoop {
         }
         ParticipantLost {
           guid_prefix,
-          is_silent,
-        } => self.remote_participant_lost(guid_prefix, is_silent),
+          reason,
+        } => {
+          let is_silent = matches!(reason, LostReason::Timeout { .. });
+          self.remote_participant_lost(guid_prefix, is_silent);
+          self.send_participant_status(DomainParticipantStatusEvent::ParticipantLost {
+            id: guid_prefix,
+            reason,
+          });
+        }
         ParticipantForgotten { guid_prefix } => self.forget_silent_participant(guid_prefix),
         AskAgain { guid_prefix } => {
           for reader in [
@@ -855,8 +874,6 @@ impl DPEventLoop {
     }
   }
 
-  #[cfg(feature = "security")] // Currently used only with security.
-                               // Just remove attribute if used also without.
   fn send_participant_status(&self, event: DomainParticipantStatusEvent) {
     self
       .participant_status_sender
