@@ -242,8 +242,8 @@ mod tests {
     use crate::model::{InstanceName, MonotonicNs, RouteId};
     use crate::shm::{QueueLimits, RouteChannel, ShmNode};
 
-    /// A pool for samples of 100 bytes, with the node and the folder that it needs.
-    fn owner() -> (PoolOwner, ShmNode, tempfile::TempDir) {
+    /// A pool for samples of 100 bytes, after the folder and the node that it needs, which are dropped later.
+    fn owner() -> (tempfile::TempDir, ShmNode, PoolOwner) {
         let root = tempfile::tempdir().unwrap();
         let node = ShmNode::open(root.path(), &InstanceName::try_from("pool").unwrap(), "test").unwrap();
         let lanes = vec![QueueLimits { queue_depth: 4, max_borrowed: 2 }];
@@ -256,12 +256,13 @@ mod tests {
             retained_samples: 0,
             backlog_samples: 0,
         };
-        (PoolOwner::new(SamplePublisher::create(&node, &channel).unwrap(), None, None), node, root)
+        let owner = PoolOwner::new(SamplePublisher::create(&node, &channel).unwrap(), None, None);
+        (root, node, owner)
     }
 
     #[test]
     fn a_lent_slot_is_filled_or_freed_by_the_main_thread() {
-        let (mut owner, _node, _root) = owner();
+        let (_root, _node, mut owner) = owner();
         let lender = owner.lender();
         for _ in 0..10 {
             let mut memory = lender.lend(100).unwrap();
@@ -282,7 +283,7 @@ mod tests {
 
     #[test]
     fn a_sample_that_the_route_does_not_allow_is_discarded_and_its_size_is_known() {
-        let (mut owner, _node, _root) = owner();
+        let (_root, _node, mut owner) = owner();
         for len in [101, 4 << 30] {
             let mut memory = owner.lender().lend(len).unwrap();
             memory.write(len - 3, &[1; 3]);
@@ -294,7 +295,7 @@ mod tests {
 
     #[test]
     fn lending_does_not_wait_while_a_lane_is_connected() {
-        let (owner, _node, _root) = owner();
+        let (_root, _node, owner) = owner();
         let connecting = owner.pool.connecting.lock().unwrap();
         assert!(owner.lender().lend(10).is_none());
         drop(connecting);
