@@ -2366,6 +2366,90 @@ mod tests {
       DomainParticipantStatusEvent::ParticipantLost { id, reason: LostReason::Disposed } if *id == prefix)));
   }
 
+  // Fast DDS handles multicast and unicast in two threads. The goodbye is due when the next announcement to
+  // all is.
+  #[test]
+  #[cfg(not(feature = "security"))]
+  fn a_goodbye_is_apart_from_announcements() {
+    use std::{
+      net::UdpSocket,
+      time::{Duration, Instant},
+    };
+
+    use crate::{
+      discovery::discovery::DiscoveryCommand,
+      messages::submessages::submessage_flag::DATA_Flags,
+      rtps::{submessage::SubmessageBody, Message},
+      test::test_data::spdp_participant_msg_mod,
+    };
+
+    const PERIOD: Duration = Duration::from_secs(2);
+    const APART: Duration = Duration::from_millis(50);
+
+    // When announcements of the participant arrive until then, and whether each is a goodbye.
+    fn arrivals(socket: &UdpSocket, of: GUID, until: Instant) -> Vec<(Instant, bool)> {
+      let mut arrivals = Vec::new();
+      let mut buffer = [0; 4096];
+      loop {
+        let left = until.saturating_duration_since(Instant::now());
+        if left.is_zero() {
+          return arrivals;
+        }
+        socket.set_read_timeout(Some(left)).unwrap();
+        let Ok((length, _)) = socket.recv_from(&mut buffer) else {
+          return arrivals;
+        };
+        let now = Instant::now();
+        let message = Message::read_from_buffer(&bytes::Bytes::copy_from_slice(&buffer[..length])).unwrap();
+        for submessage in &message.submessages {
+          if let SubmessageBody::Writer(WriterSubmessage::Data(data, flags)) = &submessage.body {
+            if message.header.guid_prefix == of.prefix
+              && data.writer_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER
+            {
+              arrivals.push((now, !flags.contains(DATA_Flags::Data)));
+            }
+          }
+        }
+      }
+    }
+
+    let domain = test_domain_id(40);
+    let bind = |port| UdpSocket::bind(("127.0.0.1", port)).unwrap();
+    let (newcomer, neighbour) = (bind(0), bind(spdp_well_known_unicast_port(domain, 5)));
+    let participant = DomainParticipant::new(domain).unwrap();
+    let own = participant.guid();
+    // Its built-in readers are there once it announces itself.
+    while arrivals(&neighbour, own, Instant::now() + Duration::from_millis(20)).is_empty() {}
+    let announcement = spdp_participant_msg_mod(newcomer.local_addr().unwrap().port());
+    let prefix = announcement.header.guid_prefix;
+    let datagram = announcement.write_to_vec_with_ctx(Endianness::LittleEndian).unwrap();
+    for participant_id in 0..5 {
+      let port = spdp_well_known_unicast_port(domain, participant_id);
+      newcomer.send_to(&datagram, ("127.0.0.1", port)).unwrap();
+    }
+    for _ in 0..5 {
+      while arrivals(&neighbour, own, Instant::now() + Duration::from_millis(20)).is_empty() {}
+      std::thread::sleep(PERIOD - Duration::from_millis(130));
+      let command = DiscoveryCommand::ReintroduceTo { prefix };
+      participant.dpi.lock().unwrap().discovery_command_sender.send(command).unwrap();
+      let until = Instant::now() + Duration::from_secs(1);
+      let (to_one, to_all) = std::thread::scope(|scope| {
+        let to_all = scope.spawn(|| arrivals(&neighbour, own, until));
+        (arrivals(&newcomer, own, until), to_all.join().unwrap())
+      });
+      let goodbye = to_one.iter().find(|(_, is_goodbye)| *is_goodbye);
+      let (goodbye, _) = *goodbye.expect("no goodbye");
+      let announced = to_one.iter().filter(|(_, is_goodbye)| !*is_goodbye);
+      assert!(announced.clone().any(|(at, _)| *at > goodbye), "no announcement after the goodbye");
+      let is_apart = |at: &Instant| at.max(&goodbye).duration_since(*at.min(&goodbye)) >= APART;
+      // The test may have been held up.
+      if !to_all.is_empty() && announced.chain(&to_all).all(|(at, _)| is_apart(at)) {
+        return;
+      }
+    }
+    panic!("an announcement comes with each goodbye");
+  }
+
   // The event loop is slow: discovery has read both announcements before it handles the first.
   #[test]
   fn a_writer_is_discovered_before_it_is_lost() {

@@ -216,6 +216,10 @@ enum DiscoveryTimerEvent {
   },
   // To those of `unanswered`, and to nobody else.
   AnswerParticipants,
+  // To those of `departing`.
+  SayGoodbye,
+  // To those of `returning`.
+  AnnounceAgain,
   // Enumerates the interfaces anew.
   FollowInterfaces,
   // Those that are left of `unconfirmed`.
@@ -287,6 +291,10 @@ pub(crate) struct Discovery {
 
   // Participants that are new, to be told of this one when the timer ends.
   unanswered: Vec<GuidPrefix>,
+  // Those who are to discover this participant anew, until the goodbye to them, and from then until
+  // the announcement.
+  departing: Vec<GuidPrefix>,
+  returning: Vec<GuidPrefix>,
   // What a former participant of the same identity knew, for the start of the loop.
   pub(crate) known: Vec<Known>,
   // The readers of those that have not been announced to this one.
@@ -375,6 +383,12 @@ impl Discovery {
   // of a new link may be lost (carrier, association, a switch that learns).
   const REPEAT_ON_NEW_LINK: [StdDuration; 2] =
     [StdDuration::from_millis(300), StdDuration::from_millis(1000)];
+  // Before and after a goodbye that is followed by an announcement, there is no announcement for so long.
+  // Fast DDS handles them in two threads, one for multicast and one for unicast: a
+  // goodbye in the middle of an announcement leaves the built-in readers of a
+  // participant matched that it does not know. They receive the announcements of its
+  // endpoints, which Fast DDS discards, and do not request them again.
+  const QUIET: StdDuration = StdDuration::from_millis(100);
   // How long others wait for the acknowledgements of a participant that was
   // killed: seven announcements, so that several of them may be lost.
   const LEASE: StdDuration = StdDuration::from_secs(15);
@@ -789,6 +803,8 @@ impl Discovery {
       announced_readers: Announced::default(),
       announced_writers: Announced::default(),
       unanswered: Vec::new(),
+      departing: Vec::new(),
+      returning: Vec::new(),
       known: Vec::new(),
       unconfirmed: BTreeSet::new(),
       dropped: BTreeSet::new(),
@@ -983,6 +999,11 @@ impl Discovery {
               match timer_event {
                 DiscoveryTimerEvent::SendParticipantInfo { reschedule } => {
                   self.follow_interfaces_without_watch();
+                  if !self.departing.is_empty() || !self.returning.is_empty() {
+                    let after = 3 * Self::QUIET;
+                    self.discovery_timer.borrow_mut().set_timeout(after, timer_event);
+                    continue;
+                  }
                   if let Some(dp) = self.domain_participant.clone().upgrade() {
                     self.spdp_publish(&dp);
                     self.reintroduce_to_silent_participants();
@@ -1009,6 +1030,15 @@ impl Discovery {
                     error!("DomainParticipant doesn't exist anymore, exiting Discovery.");
                     return;
                   };
+                  self.answer_participants(&dp);
+                }
+                DiscoveryTimerEvent::SayGoodbye => self.say_goodbye_to_the_departing(),
+                DiscoveryTimerEvent::AnnounceAgain => {
+                  let Some(dp) = self.domain_participant.clone().upgrade() else {
+                    error!("DomainParticipant doesn't exist anymore, exiting Discovery.");
+                    return;
+                  };
+                  self.unanswered.append(&mut self.returning);
                   self.answer_participants(&dp);
                 }
                 DiscoveryTimerEvent::ParticipantCleanup => {
@@ -1190,20 +1220,30 @@ impl Discovery {
     }
   }
 
-  // To that one only, a goodbye and an announcement.
+  // To that one only, a goodbye and an announcement, apart from each other and from the announcements to
+  // all.
   fn reintroduce_to(&mut self, prefix: GuidPrefix) {
-    let reader = GUID::new(prefix, EntityId::SPDP_BUILTIN_PARTICIPANT_READER);
-    let options = WriteOptionsBuilder::new().to_single_reader(reader).build();
-    let own = Participant_GUID(self.domain_participant.guid());
-    let goodbye = self.dcps_participant.writer.dispose_numbered(&own, options);
-    if let Err(e) = goodbye {
-      error!("Goodbye to {prefix:?} failed: {e:?}");
+    if self.departing.contains(&prefix) || self.returning.contains(&prefix) {
+      return;
     }
-    let Some(dp) = self.domain_participant.clone().upgrade() else {
-      return; // shutting down
-    };
-    self.unanswered.push(prefix);
-    self.answer_participants(&dp);
+    if self.departing.is_empty() {
+      self.discovery_timer.borrow_mut().set_timeout(Self::QUIET, DiscoveryTimerEvent::SayGoodbye);
+    }
+    self.departing.push(prefix);
+  }
+
+  fn say_goodbye_to_the_departing(&mut self) {
+    let own = Participant_GUID(self.domain_participant.guid());
+    for prefix in std::mem::take(&mut self.departing) {
+      let reader = GUID::new(prefix, EntityId::SPDP_BUILTIN_PARTICIPANT_READER);
+      let options = WriteOptionsBuilder::new().to_single_reader(reader).build();
+      let goodbye = self.dcps_participant.writer.dispose_numbered(&own, options);
+      if let Err(e) = goodbye {
+        error!("Goodbye to {prefix:?} failed: {e:?}");
+      }
+      self.returning.push(prefix);
+    }
+    self.discovery_timer.borrow_mut().set_timeout(Self::QUIET, DiscoveryTimerEvent::AnnounceAgain);
   }
 
   // Initialize our own participant data into the Discovery DB.
