@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::task::{Context, Poll, Wake, Waker};
 use std::time::Duration;
+use std::vec;
 
 use futures_core::Stream;
 
@@ -21,28 +22,30 @@ use crate::policy::Location;
 const MAX_ADDRESSES: usize = 64;
 
 /// The most changes that wait for [`Participant::poll_discovery`](super::Participant::poll_discovery): those
-/// beyond are lost, and found by [`Participant::find_missed`](super::Participant::find_missed).
+/// beyond are lost, and found again within a second.
 pub(super) const MAX_WAITING_CHANGES: usize = 2_048;
 
 /// The changes of discovery that the caller still takes before it does its other work: as many as can wait. A
 /// peer that announces and withdraws endpoints as fast as it can keeps no caller in a loop.
 #[derive(Debug)]
 pub struct DiscoveryTurn {
+    now: MonotonicNs,
     left: usize,
+    /// What the caller was not told of, once there is no other change left.
+    missed: Option<vec::IntoIter<Discovery>>,
 }
 
 impl DiscoveryTurn {
+    /// A turn at `now`.
+    pub const fn new(now: MonotonicNs) -> Self {
+        Self { now, left: MAX_WAITING_CHANGES, missed: None }
+    }
+
     /// Whether the turn takes another change, also one that the bridge does not look at, which then counts.
     pub(super) const fn takes_another(&mut self) -> bool {
         let takes_another = self.left > 0;
         self.left = self.left.saturating_sub(1);
         takes_another
-    }
-}
-
-impl Default for DiscoveryTurn {
-    fn default() -> Self {
-        Self { left: MAX_WAITING_CHANGES }
     }
 }
 
@@ -120,8 +123,19 @@ impl Changes {
         let _ = self.woken.recv_timeout(most);
     }
 
-    /// The next change, if there is one and `turn` still takes one.
-    pub fn poll(&mut self, turn: &mut DiscoveryTurn) -> Option<Discovery> {
+    /// The next change, if there is one and `turn` still takes one; then the ones that did not fit.
+    pub fn poll(&mut self, participant: &DomainParticipant, turn: &mut DiscoveryTurn) -> Option<Discovery> {
+        if turn.missed.is_none() {
+            if let Some(change) = self.poll_waiting(turn) {
+                return Some(change);
+            }
+            turn.missed = Some(self.find_missed(participant, turn.now).into_iter());
+        }
+        // Before what waits now, which is younger.
+        turn.missed.as_mut()?.next()
+    }
+
+    fn poll_waiting(&mut self, turn: &mut DiscoveryTurn) -> Option<Discovery> {
         let mut changes = pin!(self.listener.as_async_status_stream());
         let mut context = Context::from_waker(&self.waker);
         while turn.takes_another() {
@@ -134,15 +148,12 @@ impl Changes {
         None
     }
 
-    /// What [`poll`](Self::poll) has not told, if more changes waited than can; `None` within a second after
-    /// the last search.
-    pub fn find_missed(
-        &mut self,
-        participant: &DomainParticipant,
-        now: MonotonicNs,
-    ) -> Option<Vec<Discovery>> {
+    /// The readers and writers of which the caller was not told, and the ends of those that are gone, if more
+    /// changes waited than can; nothing within a second after the last search. The hosts of what it finds are
+    /// known by their announced addresses alone.
+    fn find_missed(&mut self, participant: &DomainParticipant, now: MonotonicNs) -> Vec<Discovery> {
         if now < self.find_missed_at || !self.listener.has_missed_events() {
-            return None;
+            return Vec::new();
         }
         self.find_missed_at = now.plus_ms(FIND_MISSED_MS);
         let mut present = BTreeSet::new();
@@ -154,7 +165,9 @@ impl Changes {
         let mut missed = self.reported.ended(&present);
         missed.extend(found.into_iter().filter_map(translate));
         missed.iter().for_each(|change| self.reported.note(change));
-        Some(missed)
+        let changes = missed.len();
+        tracing::warn!(changes, "discovery reported more changes at a time than can wait; found them");
+        missed
     }
 }
 
@@ -324,20 +337,16 @@ mod tests {
             Discovery::Writer(writer) => told.insert(writer.guid),
             _ => false,
         };
-        let mut turn = DiscoveryTurn::default();
-        while let Some(change) = changes.poll(&mut turn) {
+        let mut turn = DiscoveryTurn::new(MonotonicNs(1));
+        while let Some(change) = changes.poll(&participant, &mut turn) {
             tell(change);
         }
-        let missed = changes.find_missed(&participant, MonotonicNs(1)).unwrap();
-        assert!(!missed.is_empty());
-        missed.into_iter().for_each(|change| {
-            tell(change);
-        });
+        assert_eq!(turn.left, 0, "more changes waited than can");
         assert!(writers.iter().all(|writer| {
             let guid = super::super::rustdds::RTPSEntity::guid(writer);
             told.contains(&Guid(guid.to_bytes()))
         }));
-        assert!(changes.find_missed(&participant, MonotonicNs(2)).is_none());
+        assert!(changes.find_missed(&participant, MonotonicNs(2)).is_empty(), "within a second");
     }
 
     #[test]
@@ -359,7 +368,7 @@ mod tests {
 
     #[test]
     fn a_turn_takes_as_many_changes_as_can_wait() {
-        let mut turn = DiscoveryTurn::default();
+        let mut turn = DiscoveryTurn::new(MonotonicNs(0));
         let taken = (0..10_000).filter(|_| turn.takes_another()).count();
         assert_eq!(taken, MAX_WAITING_CHANGES);
     }

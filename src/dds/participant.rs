@@ -508,26 +508,11 @@ impl Participant {
         self.changes.wait(most);
     }
 
-    /// Returns the next change that discovery reports, if there is one and `turn` still takes one.
+    /// Returns the next change that discovery reports, if there is one and `turn` still takes one. If more
+    /// waited than can, it compares what it has returned with all that discovery has, at most once a second,
+    /// and returns the difference at the end of the turn, which is to be polled until then.
     pub fn poll_discovery(&mut self, turn: &mut DiscoveryTurn) -> Option<Discovery> {
-        self.changes.poll(turn)
-    }
-
-    /// Returns the readers and writers of which [`poll_discovery`](Self::poll_discovery) has not told, and
-    /// the ends of those that are gone, if more changes waited than can: at most once a second, because it
-    /// looks at all that discovery has. To be called after `poll_discovery`. The hosts of what it finds are
-    /// known by their announced addresses alone.
-    pub fn find_missed(&mut self, now: MonotonicNs) -> Vec<Discovery> {
-        let missed = self.changes.find_missed(&self.participant, now);
-        if let Some(missed) = &missed {
-            let (node, changes) = (&self.node_name, missed.len());
-            tracing::warn!(
-                node,
-                changes,
-                "discovery reported more changes at a time than can wait; found them"
-            );
-        }
-        missed.unwrap_or_default()
+        self.changes.poll(&self.participant, turn)
     }
 
     fn publish_graph_entry(&self) {

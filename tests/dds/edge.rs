@@ -372,7 +372,7 @@ fn readers_that_are_gone_are_not_announced_to_a_new_participant() {
     // SEDP announces readers in the order of their creation, so the present one comes last.
     while announced.last() != Some(&present.guid()) {
         assert!(Instant::now() < give_up, "the present reader was not announced");
-        match newcomer.poll_discovery(&mut DiscoveryTurn::default()) {
+        match newcomer.poll_discovery(&mut DiscoveryTurn::new(adaptive_bridge::clock::monotonic())) {
             Some(Discovery::Reader(reader)) if reader.topic.starts_with("rt/") => announced.push(reader.guid),
             Some(_) => {}
             None => std::thread::sleep(Duration::from_millis(5)),
@@ -386,7 +386,7 @@ fn a_change_that_discovery_reports_ends_the_wait_for_it() {
     let mut here = participant("here", 63);
     let mut there = None;
     loop {
-        let mut turn = DiscoveryTurn::default();
+        let mut turn = DiscoveryTurn::new(adaptive_bridge::clock::monotonic());
         let changes: Vec<_> = std::iter::from_fn(|| here.poll_discovery(&mut turn)).collect();
         let is_it =
             |change: &Discovery| matches!(change, Discovery::Writer(writer) if writer.topic == "rt/wakes");

@@ -60,7 +60,7 @@ fn read(node: &mut Participant, topic: &str) -> RawReader {
 
 /// Adds the readers that a participant has discovered, by topic.
 fn take_in(participant: &mut Participant, readers: &mut BTreeMap<String, Endpoint>) {
-    while let Some(change) = participant.poll_discovery(&mut DiscoveryTurn::default()) {
+    while let Some(change) = participant.poll_discovery(&mut DiscoveryTurn::new(clock::monotonic())) {
         if let Discovery::Reader(reader) = change
             && !participant.owns(reader.guid)
         {
@@ -151,7 +151,8 @@ impl Turn {
 
     fn take(&mut self) {
         let now = clock::monotonic();
-        while let Some(change) = self.participant.poll_discovery(&mut DiscoveryTurn::default()) {
+        while let Some(change) = self.participant.poll_discovery(&mut DiscoveryTurn::new(clock::monotonic()))
+        {
             match change {
                 Discovery::Reader(reader) => {
                     self.watch.endpoint_discovered(

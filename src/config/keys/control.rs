@@ -77,8 +77,8 @@ pub(super) const ROWS: &[Row] = &[
     restarts(&["probes.response_topic"], TOPIC, "`/adaptive_bridge/probe_resp`")
         .doc("Topic of the responses, different from the former."),
     reloads(&["subscribers.<subscriber>"], Other("a lane"), "none listed").doc(
-        "The lane of a known subscriber, by its id: `laptop: rviz`, or `laptop: {lane: rviz}`. This \
-              and `overrides` may name 64 subscribers in all.",
+        "The lane of a known subscriber, by its id: `laptop: rviz`, or `laptop: {lane: rviz}`. This and \
+         `overrides` may name 64 subscribers in all.",
     ),
     reloads(&["subscribers.<subscriber>.lane"], Other("a lane"), "must be given, or `null`")
         .doc("The same, in the second form."),

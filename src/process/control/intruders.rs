@@ -209,12 +209,8 @@ impl EndpointMonitor {
         let mut changed = false;
         for (number, (network, participant)) in self.networks.iter_mut().zip(participants).enumerate() {
             let mut are_addresses_current = false;
-            let mut turn = DiscoveryTurn::default();
-            let mut missed = None;
-            while let Some(change) = participant
-                .poll_discovery(&mut turn)
-                .or_else(|| missed.get_or_insert_with(|| participant.find_missed(now).into_iter()).next())
-            {
+            let mut turn = DiscoveryTurn::new(now);
+            while let Some(change) = participant.poll_discovery(&mut turn) {
                 // Reads the addresses once for each batch of events: after a change of this host's address, a
                 // local endpoint that is announced again would otherwise be taken for a remote one.
                 if !are_addresses_current {

@@ -346,14 +346,13 @@ impl Egress {
     fn housekeeping(&mut self, now: MonotonicNs) {
         let mut gone = Vec::new();
         let mut discovery_changed = false;
-        let mut turn = DiscoveryTurn::default();
+        let mut turn = DiscoveryTurn::new(now);
         while let Some(change) = self.participant.poll_discovery(&mut turn) {
             discovery_changed = true;
             if matches!(change, Discovery::ReaderGone(_) | Discovery::ParticipantGone { .. }) {
                 gone.push(change);
             }
         }
-        gone.extend(self.participant.find_missed(now));
         for output in &mut self.outputs {
             output.housekeeping(&mut self.participant, now);
             // After housekeeping, which may have recorded a reader that is already gone as unmatched.

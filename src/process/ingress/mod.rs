@@ -100,7 +100,7 @@ pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Res
         return Ok(());
     }
     ingress.identity.end();
-    // Nobody else says goodbye for a killed former process.
+    // If a killed former process was another participant: the next process does not know of it.
     ingress.role.dispose_former(&ingress.participant);
     // Publishes the samples that DDS has received by now. The time limit is for publishers that keep sending.
     let give_up_at = clock::monotonic().plus_ms(LAST_SAMPLES_MS);
@@ -207,14 +207,24 @@ impl Ingress {
 
     fn housekeeping(&mut self, now: MonotonicNs) -> Result<(), RoleError> {
         let mut discovery_changed = false;
-        let mut turn = DiscoveryTurn::default();
+        let mut turn = DiscoveryTurn::new(now);
         while let Some(change) = self.participant.poll_discovery(&mut turn) {
             discovery_changed = true;
-            self.apply(change);
-        }
-        for change in self.participant.find_missed(now) {
-            discovery_changed = true;
-            self.apply(change);
+            match change {
+                Discovery::Writer(writer) if !self.participant.owns(writer.guid) => {
+                    self.patterns.writer_found(&writer);
+                    self.for_each_input(|input, _| input.writer_found(&writer));
+                }
+                Discovery::WriterGone(guid) => {
+                    self.patterns.writers_gone(|writer| writer == guid);
+                    self.for_each_input(|input, _| input.writer_gone(guid));
+                }
+                Discovery::ParticipantGone { prefix, .. } => {
+                    self.patterns.writers_gone(|writer| writer.prefix() == prefix);
+                    self.for_each_input(|input, _| input.participant_gone(prefix));
+                }
+                _ => {}
+            }
         }
         self.bind_places(now);
         // A topic of a pattern may appear at any time.
@@ -255,25 +265,6 @@ impl Ingress {
         let interval_ms = if self.hold_until.is_some() { HOLD_POLL_MS } else { HOUSEKEEPING_MS };
         self.housekeeping_at = now.plus_ms(interval_ms);
         outcome
-    }
-
-    /// Applies a change of discovery.
-    fn apply(&mut self, change: Discovery) {
-        match change {
-            Discovery::Writer(writer) if !self.participant.owns(writer.guid) => {
-                self.patterns.writer_found(&writer);
-                self.for_each_input(|input, _| input.writer_found(&writer));
-            }
-            Discovery::WriterGone(guid) => {
-                self.patterns.writers_gone(|writer| writer == guid);
-                self.for_each_input(|input, _| input.writer_gone(guid));
-            }
-            Discovery::ParticipantGone { prefix, .. } => {
-                self.patterns.writers_gone(|writer| writer.prefix() == prefix);
-                self.for_each_input(|input, _| input.participant_gone(prefix));
-            }
-            _ => {}
-        }
     }
 
     /// Returns the topics of the former process to their places.

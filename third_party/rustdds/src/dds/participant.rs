@@ -858,20 +858,18 @@ impl DomainParticipant {
   ) -> Vec<DomainParticipantStatusEvent> {
     let db = self.discovery_db();
     let db = db.read().unwrap_or_else(std::sync::PoisonError::into_inner);
-    let readers = db
-      .get_all_external_topic_readers()
-      .map(|reader| (reader.reader_proxy.remote_reader_guid, reader));
-    let writers = db
-      .get_all_external_topic_writers()
-      .map(|writer| (writer.writer_proxy.remote_writer_guid, writer));
     let mut events = Vec::new();
-    for (_, reader) in readers.filter(|(guid, _)| !is_known(*guid)) {
-      let reader = reader.describe(None);
-      events.push(DomainParticipantStatusEvent::ReaderDetected { reader });
+    for reader in db.get_all_external_topic_readers() {
+      if !is_known(reader.reader_proxy.remote_reader_guid) {
+        let reader = reader.describe(None);
+        events.push(DomainParticipantStatusEvent::ReaderDetected { reader });
+      }
     }
-    for (_, writer) in writers.filter(|(guid, _)| !is_known(*guid)) {
-      let writer = writer.describe(None);
-      events.push(DomainParticipantStatusEvent::WriterDetected { writer });
+    for writer in db.get_all_external_topic_writers() {
+      if !is_known(writer.writer_proxy.remote_writer_guid) {
+        let writer = writer.describe(None);
+        events.push(DomainParticipantStatusEvent::WriterDetected { writer });
+      }
     }
     events
   }
@@ -1019,7 +1017,7 @@ pub struct DomainParticipantStatusListener {
 
 impl DomainParticipantStatusListener {
   /// Whether an event was lost since the last call, because 2,048 others had not been taken.
-  /// [`DomainParticipant::discovered_besides`] tells what there is.
+  /// [`DomainParticipant::discovered_besides`] reads the Readers and Writers that there are.
   pub fn has_missed_events(&self) -> bool {
     match self.dp_disc.lock() {
       Ok(disc) => disc.status_channel_receiver().take_missed(),
