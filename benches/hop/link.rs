@@ -14,9 +14,7 @@ use std::time::Duration;
 
 use adaptive_bridge::clock;
 use adaptive_bridge::config::{self, DdsNetwork};
-use adaptive_bridge::dds::{
-    Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos, Take, WriterEvent,
-};
+use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos, Take};
 use adaptive_bridge::model::{Durability, Encapsulation, History, QosProfile, Reliability, SourceTimestamp};
 use adaptive_bridge::shm::{Boards, BridgeShape, ShmNode};
 use bytes::{Bytes, BytesMut};
@@ -196,15 +194,11 @@ fn reader(
 fn wait_matched(writers: &[&RawWriter]) -> Result<(), String> {
     let give_up_at = clock::monotonic().plus_ms(20_000);
     for writer in writers {
-        loop {
-            match writer.poll_event() {
-                Some(WriterEvent::Matched { joined: true, .. }) => break,
-                Some(_) => {}
-                None => std::thread::sleep(Duration::from_millis(5)),
-            }
+        while writer.matched_readers().next().is_none() {
             if clock::monotonic() > give_up_at {
                 return Err("a writer has matched no reader within 20 s".to_owned());
             }
+            std::thread::sleep(Duration::from_millis(5));
         }
     }
     Ok(())

@@ -563,6 +563,5 @@ fn make_writer(
         ),
     };
     let inner = inner.map_err(|error| DdsError::library(format!("a writer of {topic}"), error))?;
-    let guid = Guid(inner.guid().to_bytes());
-    Ok(RawWriter { inner, guid })
+    Ok(RawWriter::new(inner))
 }

@@ -1,5 +1,6 @@
 //! A DDS writer of raw payloads. A write does not wait for readers unless the writer was created as blocking.
 
+use std::collections::{BTreeSet, VecDeque};
 use std::convert::Infallible;
 use std::time::Duration;
 
@@ -9,8 +10,9 @@ use super::qos;
 use super::reader::SampleOrigin;
 use super::rustdds::no_key::{DataWriter, SerializerAdapter};
 use super::rustdds::{
-    DataWriterStatus, GUID, InstanceChange, InstancePayload, RepresentationIdentifier, SampleIdentity,
-    SequenceNumber, StatusEvented, Timestamp, WriteOptionsBuilder, dds::result::WriteError as DdsWriteError,
+    DataWriterStatus, GUID, InstanceChange, InstancePayload, RTPSEntity, RepresentationIdentifier,
+    SampleIdentity, SequenceNumber, StatusEvented, Timestamp, WriteOptionsBuilder,
+    dds::result::WriteError as DdsWriteError,
 };
 use crate::model::{
     Encapsulation, Guid, KeyedPayload, ReaderRecord, SampleKey, SourceTimestamp, TypeHash, UnmatchedPolicy,
@@ -50,7 +52,8 @@ pub enum WriterEvent {
         joined: bool,
         /// The number of readers that are matched now.
         readers: u64,
-        /// If it was unmatched: samples that had left the history and that it had not acknowledged.
+        /// If it was unmatched: samples that had left the history and that it had not acknowledged. 0 if
+        /// the event did not fit into the queue of the DDS library; [`RawWriter::overrun`] has them.
         missed: u64,
     },
     /// A reader requests a stronger QoS than the writer offers.
@@ -73,11 +76,17 @@ pub struct Written {
 
 /// A DDS writer of raw payloads.
 pub struct RawWriter {
-    pub(super) inner: DataWriter<RawPayload, PayloadEncoder>,
-    pub(super) guid: Guid,
+    inner: DataWriter<RawPayload, PayloadEncoder>,
+    guid: Guid,
+    matching: Matching,
 }
 
 impl RawWriter {
+    pub(super) fn new(inner: DataWriter<RawPayload, PayloadEncoder>) -> Self {
+        let guid = Guid(inner.guid().to_bytes());
+        Self { inner, guid, matching: Matching::default() }
+    }
+
     /// The writer's GUID.
     pub fn guid(&self) -> Guid {
         self.guid
@@ -265,27 +274,58 @@ impl RawWriter {
         self.inner.wait_for_acknowledgments(timeout).unwrap_or(false)
     }
 
-    /// Returns the next change of the matched readers, if there is one.
-    pub fn poll_event(&self) -> Option<WriterEvent> {
+    /// Returns the next change of the matched readers, if there is one. Those that did not fit into the
+    /// queue of the DDS library, which has 256 places, come after the others.
+    pub fn poll_event(&mut self) -> Option<WriterEvent> {
         loop {
-            match self.inner.try_recv_status()? {
-                DataWriterStatus::PublicationMatched { current, reader, missed, .. } => {
-                    return Some(WriterEvent::Matched {
-                        reader: Guid(reader.to_bytes()),
-                        joined: current.count_change() > 0,
-                        readers: u64::try_from(current.count()).unwrap_or(0),
-                        missed,
-                    });
+            let event = match self.inner.try_recv_status() {
+                Some(DataWriterStatus::PublicationMatched { current, reader, missed, .. }) => {
+                    self.matching.note(Guid(reader.to_bytes()), current.count_change() > 0, missed)
                 }
-                DataWriterStatus::OfferedIncompatibleQos { reader, last_policy_id, .. } => {
-                    return Some(WriterEvent::Incompatible {
-                        reader: Guid(reader.to_bytes()),
-                        policy: qos::unmatched_policy(last_policy_id),
-                    });
+                Some(DataWriterStatus::OfferedIncompatibleQos { reader, last_policy_id, .. }) => {
+                    let policy = qos::unmatched_policy(last_policy_id);
+                    Some(WriterEvent::Incompatible { reader: Guid(reader.to_bytes()), policy })
                 }
-                _ => {}
+                Some(_) => None,
+                None => {
+                    if self.inner.has_missed_events() {
+                        let matched = self.inner.matched_readers();
+                        self.matching.compare(matched.iter().map(|reader| Guid(reader.guid.to_bytes())));
+                    }
+                    let (reader, joined) = self.matching.found.pop_front()?;
+                    self.matching.note(reader, joined, 0)
+                }
+            };
+            if event.is_some() {
+                return event;
             }
         }
+    }
+}
+
+/// The readers that a writer has reported as matched.
+#[derive(Default)]
+struct Matching {
+    reported: BTreeSet<Guid>,
+    /// Changes that the DDS library did not report, which [`note`](Self::note) has not noted yet.
+    found: VecDeque<(Guid, bool)>,
+}
+
+impl Matching {
+    /// Notes a change, and returns its event, unless it is the end of a match that was not reported. A match
+    /// that was reported is a change, too: the end of the one before may be among those without a report.
+    fn note(&mut self, reader: Guid, joined: bool, missed: u64) -> Option<WriterEvent> {
+        let was_reported = if joined { !self.reported.insert(reader) } else { self.reported.remove(&reader) };
+        let readers = self.reported.len() as u64;
+        (joined || was_reported).then_some(WriterEvent::Matched { reader, joined, readers, missed })
+    }
+
+    /// Finds the changes of which there was no report, by the readers that are matched.
+    fn compare(&mut self, matched: impl Iterator<Item = Guid>) {
+        let matched: BTreeSet<Guid> = matched.collect();
+        let left = self.reported.difference(&matched).map(|reader| (*reader, false));
+        let joined = matched.difference(&self.reported).map(|reader| (*reader, true));
+        self.found = left.chain(joined).collect();
     }
 }
 

@@ -13,7 +13,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use adaptive_bridge::config::{self, DdsNetwork};
-use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos, WriterEvent};
+use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos};
 use adaptive_bridge::model::{
     DropReason, Durability, Encapsulation, NetworkRefusal, ProbeRefusal, QosProfile, Reliability,
     SourceTimestamp,
@@ -92,9 +92,7 @@ impl Publisher {
     fn new(domain_id: u16) -> Self {
         let mut participant = participant("publisher", domain_id);
         let writer = participant.create_writer("rt/scan", TYPE, &QosProfile::CRITICAL, 1_000).unwrap();
-        wait_until("ingress to match the publisher", || {
-            matches!(writer.poll_event(), Some(WriterEvent::Matched { joined: true, .. }))
-        });
+        wait_until("ingress to match the publisher", || writer.matched_readers().next().is_some());
         Self { writer, _participant: participant }
     }
 

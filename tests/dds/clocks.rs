@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use adaptive_bridge::clock;
 use adaptive_bridge::config::DdsNetwork;
-use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos, WriterEvent};
+use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, ReaderQos};
 use adaptive_bridge::model::{Durability, Encapsulation, QosProfile, Reliability, SourceTimestamp, WallNs};
 use bytes::Bytes;
 use serde_json::Value;
@@ -58,9 +58,7 @@ impl Publisher {
         let mut participant = participant("publisher");
         let writer: RawWriter =
             participant.create_writer("rt/scan", TYPE, &QosProfile::CRITICAL, 1_000).unwrap();
-        wait_until("ingress to match the publisher", || {
-            matches!(writer.poll_event(), Some(WriterEvent::Matched { joined: true, .. }))
-        });
+        wait_until("ingress to match the publisher", || writer.matched_readers().next().is_some());
         let shift_ms = Arc::new(AtomicI64::new(shift_ms));
         let stop = Arc::new(AtomicBool::new(false));
         let (shift, stopped) = (Arc::clone(&shift_ms), Arc::clone(&stop));

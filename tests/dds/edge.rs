@@ -60,13 +60,9 @@ fn take_one(reader: &RawReader) -> Option<(Vec<u8>, Encapsulation, SourceTimesta
 
 fn wait_for_reader(writer: &RawWriter) {
     let give_up = Instant::now() + Duration::from_secs(20);
-    loop {
-        match writer.poll_event() {
-            Some(WriterEvent::Matched { joined: true, .. }) => return,
-            Some(_) => {}
-            None => std::thread::sleep(Duration::from_millis(5)),
-        }
+    while writer.matched_readers().next().is_none() {
         assert!(Instant::now() < give_up, "no reader was matched");
+        std::thread::sleep(Duration::from_millis(5));
     }
 }
 
@@ -326,7 +322,7 @@ fn a_fragmented_sample_is_assembled_in_lent_memory() {
 fn a_writer_reports_the_present_reader_after_many_that_are_gone() {
     let mut here = participant("here", 79);
     let mut there = participant("there", 79);
-    let writer = there.create_writer("rt/many", TYPE, &QosProfile::CRITICAL, 64).unwrap();
+    let mut writer = there.create_writer("rt/many", TYPE, &QosProfile::CRITICAL, 64).unwrap();
     let qos = reader_qos(Reliability::Reliable, Durability::Volatile);
     let give_up = Instant::now() + Duration::from_secs(20);
     let mut present = None;
@@ -467,7 +463,7 @@ fn a_keep_all_writer_that_may_wait_reports_a_full_window() {
 fn a_late_joiner_of_a_best_effort_writer_can_be_given_the_last_sample() {
     let mut here = participant("here", 72);
     let qos = QosProfile { durability: Durability::TransientLocal, ..QosProfile::NONCRITICAL };
-    let writer = here.create_writer("rt/map", TYPE, &qos, 64).unwrap();
+    let mut writer = here.create_writer("rt/map", TYPE, &qos, 64).unwrap();
     writer.write(Bytes::from_static(b"a map..."), Encapsulation::CDR_LE, SourceTimestamp(1)).unwrap();
     let mut there = participant("there", 72);
     let reader = there

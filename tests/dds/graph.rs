@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use adaptive_bridge::config::DdsNetwork;
-use adaptive_bridge::dds::{GraphWatch, Participant, ParticipantOptions, RawWriter, WriterEvent};
+use adaptive_bridge::dds::{GraphWatch, Participant, ParticipantOptions, RawWriter};
 use adaptive_bridge::model::{Durability, Encapsulation, QosProfile, SourceTimestamp};
 use bytes::Bytes;
 
@@ -42,9 +42,7 @@ fn a_poll_takes_a_limited_part_of_a_flood_of_graph_entries() {
     let mut watch = here.watch_graph().unwrap();
     let mut there = participant("there");
     let writer = there.create_writer("ros_discovery_info", TYPE, &QOS, 64).unwrap();
-    support::wait_until("the reader of the graph", || {
-        matches!(writer.poll_event(), Some(WriterEvent::Matched { joined: true, .. }))
-    });
+    support::wait_until("the reader of the graph", || writer.matched_readers().next().is_some());
     // The entries that the participants publish of themselves would count among the 256: they come first.
     support::wait_until("the entries of both participants", || {
         watch.poll();

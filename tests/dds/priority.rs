@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
 
 use adaptive_bridge::config::DdsNetwork;
-use adaptive_bridge::dds::{Kept, Participant, ParticipantOptions, RawWriter, ReaderQos, WriterEvent};
+use adaptive_bridge::dds::{Kept, Participant, ParticipantOptions, RawWriter, ReaderQos};
 use adaptive_bridge::model::{Durability, Encapsulation, Guid, QosProfile, Reliability, SourceTimestamp};
 use bytes::Bytes;
 use support::bed::{is_accounted_and_idle, outputs};
@@ -49,7 +49,7 @@ fn write(writer: &RawWriter) {
 }
 
 fn wait_matched(writer: &RawWriter) {
-    wait_until("a reader", || matches!(writer.poll_event(), Some(WriterEvent::Matched { joined: true, .. })));
+    wait_until("a reader", || writer.matched_readers().next().is_some());
 }
 
 #[test]

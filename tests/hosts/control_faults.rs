@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use adaptive_bridge::clock;
 use adaptive_bridge::config::{DdsNetwork, SecretSource, Security, TrustMode};
 use adaptive_bridge::dds::{
-    Participant, ParticipantOptions, RawReader, RawWriter, ReaderEvent, ReaderQos, Take, WriterEvent,
+    Participant, ParticipantOptions, RawReader, RawWriter, ReaderEvent, ReaderQos, Take,
 };
 use adaptive_bridge::model::{
     Durability, Encapsulation, History, ProbeRefusal, QosProfile, Reliability, SourceTimestamp, WallNs,
@@ -449,9 +449,7 @@ impl Attacker {
             _participant: participant,
         };
         // The writer matches two readers: the attacker's own and that of control.
-        wait_until("control's reader of responses", || {
-            matches!(attacker.writer.poll_event(), Some(WriterEvent::Matched { readers: 2.., .. }))
-        });
+        wait_until("control's reader of responses", || attacker.writer.matched_readers().count() >= 2);
         wait_until("a probe", || attacker.receive_request().is_some());
         attacker
     }

@@ -2,7 +2,7 @@
 //! not published, or a part of another one, and none misses a sample. Peers compare each byte.
 
 use adaptive_bridge::config::DdsNetwork;
-use adaptive_bridge::dds::{Participant, ParticipantOptions, RawWriter, ReaderQos, Take, WriterEvent};
+use adaptive_bridge::dds::{Participant, ParticipantOptions, RawWriter, ReaderQos, Take};
 use adaptive_bridge::model::{Durability, Encapsulation, QosProfile, Reliability, SourceTimestamp};
 use bytes::Bytes;
 use nix::sys::signal::Signal;
@@ -64,8 +64,7 @@ fn participant(bed: &Bed, host: &str) -> Participant {
 }
 
 fn wait_matched(writer: &RawWriter, what: &str) {
-    let is_match = |event| matches!(event, Some(WriterEvent::Matched { joined: true, .. }));
-    support::wait_until(what, || is_match(writer.poll_event()));
+    support::wait_until(what, || writer.matched_readers().next().is_some());
 }
 
 /// Sends three quarters of a sample, and gives the lane time to send as much.

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use adaptive_bridge::clock;
 use adaptive_bridge::config::{DdsNetwork, SecretSource, Security, TrustMode};
-use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, Take, WriterEvent};
+use adaptive_bridge::dds::{Participant, ParticipantOptions, RawReader, RawWriter, Take};
 use adaptive_bridge::model::{Encapsulation, SourceTimestamp, WallNs};
 use adaptive_bridge::policy::burst_for;
 use adaptive_bridge::process::probes::{
@@ -79,9 +79,7 @@ impl Asker {
             Asker { responses, requests, _participant: participant, name, sent: 0, received: Vec::new() }
         });
         let asker = joined.join().unwrap();
-        wait_until("a responder", || {
-            matches!(asker.requests.poll_event(), Some(WriterEvent::Matched { readers: 1, .. }))
-        });
+        wait_until("a responder", || asker.requests.matched_readers().count() == 1);
         asker
     }
 

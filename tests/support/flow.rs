@@ -7,7 +7,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use adaptive_bridge::clock;
-use adaptive_bridge::dds::{Participant, RawReader, RawWriter, ReaderQos, Take, WriterEvent};
+use adaptive_bridge::dds::{Participant, RawReader, RawWriter, ReaderQos, Take};
 use adaptive_bridge::model::{Durability, Encapsulation, QosProfile, Reliability, SourceTimestamp};
 use bytes::Bytes;
 use serde_json::Value;
@@ -62,9 +62,7 @@ impl Flow {
         let mut publisher = join("publisher");
         let writer: RawWriter =
             publisher.create_writer("rt/scan", TYPE, &QosProfile::CRITICAL, 1_000).unwrap();
-        wait_until("ingress matched by the publisher", || {
-            matches!(writer.poll_event(), Some(WriterEvent::Matched { joined: true, .. }))
-        });
+        wait_until("ingress matched by the publisher", || writer.matched_readers().next().is_some());
         let mut subscriber = join("subscriber");
         let qos = ReaderQos {
             reliability: Reliability::Reliable,

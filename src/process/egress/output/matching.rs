@@ -14,7 +14,7 @@ impl Output {
     }
 
     pub(super) fn follow_matching(&mut self, now: MonotonicNs) {
-        let Some(writer) = &self.writer else {
+        let Some(writer) = &mut self.writer else {
             return;
         };
         while let Some(event) = writer.poll_event() {

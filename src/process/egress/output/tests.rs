@@ -18,6 +18,8 @@ use crate::shm::{BacklogKeeper, SamplePublisher};
 
 /// A sample that the lane may begin to send before it is complete.
 const LARGE: usize = 1 << 20;
+/// The DDS topic of the critical lane's first output.
+const OUTPUT: &str = "rt/adaptive_bridge/critical/scan";
 /// The lanes by their number.
 const CRITICAL: usize = 0;
 const NONCRITICAL: usize = 1;
@@ -93,14 +95,22 @@ impl Host {
         let options = participant_options(&self.settings, &self.settings.lanes[self.lane].network, "reader");
         let mut participant = Participant::open(&options).unwrap();
         let qos = ReaderQos { reliability, durability, depth: 16, deadline_ms: None };
-        let reader = participant.create_reader("rt/adaptive_bridge/critical/scan", TYPE, &qos).unwrap();
-        Subscriber { reader, _participant: participant }
+        let reader = participant.create_reader(OUTPUT, TYPE, &qos).unwrap();
+        Subscriber { reader, qos, participant }
     }
 }
 
 struct Subscriber {
     reader: RawReader,
-    _participant: Participant,
+    qos: ReaderQos,
+    participant: Participant,
+}
+
+impl Subscriber {
+    /// Creates another reader of the same participant.
+    fn add_reader(&mut self) -> RawReader {
+        self.participant.create_reader(OUTPUT, TYPE, &self.qos).unwrap()
+    }
 }
 
 fn header(sequence: u64) -> SampleHeader {

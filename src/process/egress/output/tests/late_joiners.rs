@@ -2,6 +2,7 @@
 
 use super::super::super::late_joiners::{LateJoiners, MAX_WAITING};
 use super::*;
+use std::collections::BTreeSet;
 
 const YAML: &str = "topics: [{id: scan, input_topic: /scan, qos_overrides: \
                     {critical: {reliability: BEST_EFFORT, durability: TRANSIENT_LOCAL}}}]";
@@ -45,4 +46,28 @@ fn a_late_joiner_for_which_no_place_is_free_is_counted() {
     let _no_place = host.subscribe_with(Reliability::BestEffort, Durability::TransientLocal);
     wait_readers(&mut output, 2);
     assert_eq!(unserved(&output), 1);
+}
+
+#[test]
+fn more_late_joiners_at_once_than_events_can_wait_are_all_served() {
+    const READERS: u64 = 300;
+    let mut host = Host::start(173, CRITICAL, YAML);
+    host.announce_type();
+    let mut output = host.open();
+    let mut subscriber = host.subscribe_with(Reliability::BestEffort, Durability::TransientLocal);
+    let others: Vec<_> = (1..READERS).map(|_| subscriber.add_reader()).collect();
+    let matched = |output: &Output| output.writer.as_ref().unwrap().matched_readers().count() as u64;
+    wait_until("the DDS library matches the readers", || matched(&output) == READERS);
+    output.follow_matching(clock::monotonic());
+    assert_eq!(output.counters.get().readers, READERS);
+    let mut due = BTreeSet::new();
+    while let Some((reader, _)) = waiting(&mut output).next_due(clock::monotonic().plus_ms(60_000), &mut 1) {
+        due.insert(reader);
+    }
+    assert_eq!(due.len() as u64, READERS);
+
+    drop((subscriber, others));
+    wait_until("the DDS library forgets the readers", || matched(&output) == 0);
+    output.follow_matching(clock::monotonic());
+    assert_eq!(output.counters.get().readers, 0);
 }

@@ -613,6 +613,12 @@ where
     self.send_buffer.matched_readers()
   }
 
+  /// Whether a status event was lost since the last call, because as many waited as are kept.
+  /// [`Self::matched_readers`] has the Readers that are matched.
+  pub fn has_missed_events(&self) -> bool {
+    self.status_receiver.take_missed()
+  }
+
   /// What all readers missed since the writer was created: the overruns of those that are
   /// matched, and of those that have left. Of one that has left, also what had left the
   /// history before it acknowledged it. It never decreases.
