@@ -143,6 +143,11 @@ pub(crate) struct RtpsReaderProxy {
   // The path to the reader loses packets. Until then it gets large samples in datagrams
   // of one packet, see LARGE_SAMPLE_DATAGRAM.
   small_datagrams_until: Option<Instant>,
+
+  // The first sample of which every fragment was sent to it. Requests for those before say
+  // nothing of the path: they were withheld while the reader was joining, or a former
+  // Writer was sending them.
+  sent_whole_from: SequenceNumber,
 }
 
 impl RtpsReaderProxy {
@@ -175,6 +180,7 @@ impl RtpsReaderProxy {
       send_route: SendRoute::default(),
       max_datagram_payload: FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE,
       small_datagrams_until: None,
+      sent_whole_from: SequenceNumber::zero(),
     }
   }
 
@@ -547,6 +553,7 @@ impl RtpsReaderProxy {
       send_route: SendRoute::default(),
       max_datagram_payload: FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE,
       small_datagrams_until: None,
+      sent_whole_from: SequenceNumber::zero(),
     }
   }
 
@@ -632,6 +639,7 @@ impl RtpsReaderProxy {
       send_route: SendRoute::default(),
       max_datagram_payload: FALLBACK_MAX_AGGREGATED_DATAGRAM_SIZE,
       small_datagrams_until: None,
+      sent_whole_from: SequenceNumber::zero(),
     }
   }
 
@@ -720,6 +728,16 @@ impl RtpsReaderProxy {
         .filter(|number| (1..=OBSERVED_FRAGMENTS).contains(number))
         .count() as u32
         >= OBSERVED_FRAGMENTS / 2
+  }
+
+  /// From this sample on, every fragment is sent to the reader.
+  pub fn send_whole_from(&mut self, first: SequenceNumber) {
+    self.sent_whole_from = first;
+  }
+
+  /// Whether every fragment of the sample was sent to the reader.
+  pub fn was_sent_whole(&self, sn: SequenceNumber) -> bool {
+    self.sent_whole_from <= sn
   }
 
   /// Sends large samples in datagrams of one packet for a while.

@@ -1628,8 +1628,8 @@ impl Writer {
         // together are served by one repair round. If a round is already
         // pending, it also serves what this ACKNACK requested.
         if start_repair {
-          if self.requests_large_sample(an) {
-            self.send_small_datagrams_to(reader_guid_prefix);
+          if let Some(sn) = self.requests_large_sample(an) {
+            self.send_small_datagrams_to(reader_guid, sn);
           }
           self.schedule_repair_data(reader_guid, self.nack_response_delay);
         }
@@ -1782,7 +1782,7 @@ impl Writer {
         };
         let (fragment_count, _) = self.num_frags_and_frag_size(cc.data_value.payload_size());
         if RtpsReaderProxy::shows_loss(&nackfrag.fragment_number_state, fragment_count) {
-          self.send_small_datagrams_to(reader_guid_prefix);
+          self.send_small_datagrams_to(reader_guid, nackfrag.writer_sn);
         }
         if let Some(reader_proxy) = self.lookup_reader_proxy_mut(reader_guid) {
           reader_proxy.mark_frags_requested(
@@ -1798,25 +1798,34 @@ impl Writer {
     }
   }
 
-  // Whether the first sample that is requested as a whole is a large one: none of its
+  // The first sample that is requested as a whole, if it is a large one: none of its
   // datagrams has arrived, as where the path drops every packet of a split datagram.
-  fn requests_large_sample(&self, an: &AckNack) -> bool {
-    let first = (an.reader_sn_state.base() <= self.last_sent())
-      .then(|| an.reader_sn_state.iter().next())
-      .flatten();
-    first
-      .and_then(|sn| self.send_buffer.get_by_sn(sn))
-      .is_some_and(|cc| cc.data_value.payload_size() >= LARGE_SAMPLE_BYTES)
+  fn requests_large_sample(&self, an: &AckNack) -> Option<SequenceNumber> {
+    if an.reader_sn_state.base() > self.last_sent() {
+      return None;
+    }
+    let first = an.reader_sn_state.iter().next()?;
+    let payload_size = self.send_buffer.get_by_sn(first)?.data_value.payload_size();
+    (payload_size >= LARGE_SAMPLE_BYTES).then_some(first)
   }
 
-  // All readers of a participant are reached over the same path, and those at the same
-  // address share datagrams.
-  fn send_small_datagrams_to(&mut self, participant: GuidPrefix) {
+  // The path to the participant of a reader loses packets, if all of that sample was sent
+  // to it. All readers of a participant are reached over the same path, and those at the
+  // same address share datagrams.
+  fn send_small_datagrams_to(&mut self, reader_guid: GUID, sn: SequenceNumber) {
+    let was_sent_whole = |reader: &RtpsReaderProxy| reader.was_sent_whole(sn);
+    if !self.readers.get(&reader_guid).is_some_and(was_sent_whole) {
+      return;
+    }
     let now = Instant::now();
-    let readers = self.readers.values_mut();
-    readers
-      .filter(|reader| reader.remote_reader_guid.prefix == participant)
-      .for_each(|reader| reader.send_small_datagrams(now));
+    let of_participant = self.readers.range_mut(reader_guid.prefix.range());
+    of_participant.for_each(|(_, reader)| reader.send_small_datagrams(now));
+  }
+
+  // The first sample of which a reader that is sent to from now on gets every fragment: the
+  // one after the last may have been begun.
+  fn first_whole_sample(&self) -> SequenceNumber {
+    self.send_buffer.last_change_sequence_number().plus_1().plus_1()
   }
 
   // Recompute the reliable acknowledgement frontier (the smallest
@@ -2861,6 +2870,7 @@ impl Writer {
       && new_guid.prefix != self.my_guid.prefix
       // It knows this Writer from the former process.
       && !send_buffer.is_former_reader(new_guid);
+    let first_whole_sample = self.first_whole_sample();
     self
       .readers
       .entry(updated_reader_proxy.remote_reader_guid)
@@ -2890,6 +2900,7 @@ impl Writer {
           wants_history,
         );
         new_proxy.start_progress(progress, is_builtin);
+        new_proxy.send_whole_from(first_whole_sample);
         if joins {
           new_proxy.start_joining();
         }
@@ -3008,7 +3019,9 @@ impl Writer {
     let mut no_other_sender = send_buffer.direct_send().lock();
     let last = self.last_sent();
     let first_retained = send_buffer.first_change_sequence_number();
+    let first_whole_sample = self.first_whole_sample();
     if let Some(reader) = self.readers.get_mut(&reader_guid) {
+      reader.send_whole_from(first_whole_sample);
       let first = max(first_retained, reader.all_acked_before);
       reader.request_changes(first..last.plus_1());
     }
@@ -4094,6 +4107,12 @@ mod tests {
         frags_per_datafrag(header, budget(f, payload_size), 1, num_frags, size, payload_size)
       };
       assert_eq!((per_datagram(&f, 60_000), per_datagram(&f, 1_000_000)), (1, 10));
+      // The reader was matched after the sample was sent.
+      nack_frag(&mut f, 1, frags(10..=30), 4);
+      f.ack_nack(1..=1, 2);
+      assert_eq!(per_datagram(&f, 1_000_000), 10);
+      let first = SequenceNumber::new(1);
+      f.writer.readers.values_mut().for_each(|reader| reader.send_whole_from(first));
       // What does not fit the reader's receive buffer, and what does not exist.
       nack_frag(&mut f, 1, frags(100..=300), 1);
       nack_frag(&mut f, 1, all_from(u32::MAX - 3), 3);
