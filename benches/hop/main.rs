@@ -15,7 +15,6 @@
 
 mod beds;
 mod buffers;
-mod cpu_delay;
 mod histogram;
 mod isolation;
 mod large;

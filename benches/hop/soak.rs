@@ -5,9 +5,9 @@ use std::os::unix::fs::MetadataExt;
 use std::time::{Duration, Instant};
 
 use adaptive_bridge_measure::hop::{Lossy, Soak, SoakSeries};
+use support::cpu_delay::CpuDelayMonitor;
 
 use super::beds::{Beds, Ending, Plan, add_up};
-use super::cpu_delay::CpuDelayMonitor;
 use super::options::{Case, Options, SCAN};
 use super::out::{Output, RowKey};
 use super::system::{Usage, descriptors};

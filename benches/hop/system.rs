@@ -215,16 +215,6 @@ pub fn keep_cpus_awake() -> Result<fs::File, String> {
     })
 }
 
-/// Pins this thread to a CPU and gives it the highest real-time priority.
-pub fn run_with_highest_priority_on(cpu: usize) {
-    Place { cpu: Some(cpu), scheduling: Scheduling::Other }.apply();
-    if let Err(error) = set_policy(libc::SCHED_FIFO, 99) {
-        eprintln!(
-            "bench: no SCHED_FIFO: {error}; the delays of CPU {cpu} include those by other threads on it"
-        );
-    }
-}
-
 fn set_policy(policy: libc::c_int, priority: libc::c_int) -> nix::Result<()> {
     // SAFETY: `sched_param` is plain data for which all zeroes are valid, and the call only reads it.
     let outcome = unsafe {

@@ -220,8 +220,11 @@ fn a_bridge_with_standbys_that_ends_says_goodbye() {
 mod long {
     use std::time::Instant;
 
+    use adaptive_bridge::clock;
+    use adaptive_bridge::model::MonotonicNs;
     use nix::sys::signal::kill;
     use nix::unistd::Pid;
+    use support::cpu_delay::{CpuDelay, CpuDelayMonitor};
 
     use super::super::hostile::Random;
     use super::*;
@@ -263,28 +266,33 @@ mod long {
         let mut random = Random(u64::from(std::process::id()) | 1);
         println!("seed {}", random.0);
         let until = Instant::now() + Duration::from_secs(seconds);
-        let mut faults = [0; 2];
+        let (monitor, mut delays) = (CpuDelayMonitor::start(), Vec::new());
+        let mut faults = Vec::new();
         while Instant::now() < until {
             std::thread::sleep(Duration::from_millis(2_000 + random.below(8_000) as u64));
             let status = bed.bridge.status();
-            let pids: Vec<u64> = status["processes"]
-                .as_array()
-                .unwrap()
-                .iter()
-                .flat_map(|process| [number(&process["pid"]), number(&process["standby"]["pid"])])
-                .filter(|pid| *pid != 0)
-                .collect();
-            let pid = Pid::from_raw(i32::try_from(pids[random.below(pids.len())]).unwrap());
-            let is_stop = random.below(4) == 0;
-            faults[usize::from(is_stop)] += 1;
+            let processes = status["processes"].as_array().unwrap().iter();
+            let of = |process: &Value| {
+                let name = process["name"].as_str().unwrap();
+                [(number(&process["pid"]), name.to_owned())]
+                    .into_iter()
+                    .chain([(number(&process["standby"]["pid"]), format!("standby of {name}"))])
+            };
+            let pids: Vec<_> = processes.flat_map(of).filter(|(pid, _)| *pid != 0).collect();
+            let (pid, name) = &pids[random.below(pids.len())];
+            let pid = Pid::from_raw(i32::try_from(*pid).unwrap());
+            let sent = if random.below(4) == 0 { Signal::SIGSTOP } else { Signal::SIGKILL };
+            faults.push((clock::monotonic(), format!("{sent} of {name}"), sent));
             // It may have ended already.
-            let _ = kill(pid, if is_stop { Signal::SIGSTOP } else { Signal::SIGKILL });
-            if is_stop {
+            let _ = kill(pid, sent);
+            if sent == Signal::SIGSTOP {
                 std::thread::sleep(Duration::from_millis(random.below(4_000) as u64));
                 let _ = kill(pid, Signal::SIGCONT);
             }
+            delays.extend(monitor.take());
         }
-        println!("{} killed, {} stopped", faults[0], faults[1]);
+        let stops = faults.iter().filter(|(.., sent)| *sent == Signal::SIGSTOP).count();
+        println!("{} killed, {stops} stopped", faults.len() - stops);
         for (_, subscriber) in &subscribers {
             subscriber.wait_received(subscriber.received() + 50);
         }
@@ -301,6 +309,7 @@ mod long {
                 .wait_for("the last sample", |event| event["last"] == sent.last || event["seq"] == sent.last);
             if name == WATCHED {
                 println!("{}", pauses(&subscriber));
+                list_pauses(&subscriber, &faults, &delays);
             }
             end(name, subscriber, sent).assert_all_of(sent);
         }
@@ -313,5 +322,34 @@ mod long {
         pauses.sort_by(f64::total_cmp);
         let at = |part: f64| pauses[((pauses.len() - 1) as f64 * part) as usize];
         format!("pauses: p99 {:.1}, p99.9 {:.1}, max {:.1} ms", at(0.99), at(0.999), at(1.0))
+    }
+
+    /// Lists the pauses that are longer than the goal, each with the fault before it and with what the machine
+    /// kept the CPUs from their work meanwhile.
+    fn list_pauses(subscriber: &RunningPeer, faults: &[(MonotonicNs, String, Signal)], delays: &[CpuDelay]) {
+        const GOAL_NS: u64 = 20_000_000;
+        let wall_ns = clock::wall().0 - clock::monotonic().0;
+        let events = subscriber.events().into_iter().filter(|event| event["event"] == "sample");
+        let arrivals: Vec<MonotonicNs> = events
+            .map(|event| {
+                let latency_ns = (event["latency_us"].as_f64().unwrap() * 1e3) as u64;
+                MonotonicNs(number(&event["source_ns"]) + latency_ns - wall_ns)
+            })
+            .collect();
+        let ms = |ns: u64| ns as f64 / 1e6;
+        for pair in arrivals.windows(2).filter(|pair| pair[1].since(pair[0]) > GOAL_NS) {
+            let (from, to) = (pair[0], pair[1]);
+            let delay_ns: u64 = delays.iter().map(|delay| delay.ns_between(from, to)).sum();
+            let fault = faults.iter().rev().find(|(at, ..)| *at < to);
+            let fault = fault.map_or_else(
+                || "before all faults".to_owned(),
+                |(at, what, _)| format!("{:.1} ms after {what}", (from.0 as f64 - at.0 as f64) / 1e6),
+            );
+            println!(
+                "pause of {:.1} ms, which began {fault}; the CPUs were kept from the control thread for {:.1} ms of it",
+                ms(to.since(from)),
+                ms(delay_ns)
+            );
+        }
     }
 }

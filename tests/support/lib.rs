@@ -9,6 +9,7 @@
 
 pub mod bed;
 pub mod bridge;
+pub mod cpu_delay;
 pub mod flow;
 pub mod forger;
 pub mod impairment;
