@@ -4,11 +4,13 @@
 use std::net::{SocketAddrV4, UdpSocket};
 
 use serde_json::Value;
-use support::bed::{Bed, CRITICAL, INPUT, SCAN};
+use support::bed::{Bed, CRITICAL, INPUT, SCAN, SCAN_TYPE};
 use support::bridge::refused;
+use support::forger::Forger;
 use support::peer::{Peer, Received, Sent};
 use support::process::memory_kib;
-use support::rtps::{Fragment, Message, Prefix, SEDP_PUBLICATIONS, SEDP_SUBSCRIPTIONS};
+use support::rtps::{EntityId, Fragment, Message, Prefix, SEDP_PUBLICATIONS, SEDP_SUBSCRIPTIONS};
+use support::visitors::Endpoint;
 
 const ROLES: [&str; 4] = ["ingress", "control", "egress-critical", "egress-noncritical"];
 /// How much the resident memory of each process may grow. The fragments of the attack are 480 MB for each.
@@ -42,6 +44,55 @@ fn attack(socket: &UdpSocket, processes: &[SocketAddrV4]) {
         // Leaves time for the bridge, whose sockets would discard most of it otherwise.
         std::thread::sleep(std::time::Duration::from_millis(5));
     }
+}
+
+/// Publishers of one participant that complete no sample.
+const WRITERS: u8 = 40;
+/// The samples that each of them begins: 158 MB in all, of which a route with samples of 64 KiB keeps 1 MiB,
+/// and 8 MiB of one publisher.
+const UNFINISHED: i64 = 66;
+
+#[test]
+fn samples_of_an_input_that_never_become_complete_take_little_memory() {
+    let test = "samples_of_an_input_that_never_become_complete_take_little_memory";
+    let _alone = support::exclusive();
+    let Some(bed) = Bed::start(test, SCAN) else { return };
+    let critical = bed.subscribe("critical", Peer::fast().keep_all(), CRITICAL);
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
+    critical.wait_received(100);
+    let ingress = bed.pid("ingress");
+    let before_kib = memory_kib(ingress, "VmHWM");
+
+    let forger = Forger::new(bed.host("slow"), 1, ingress);
+    let writers: Vec<EntityId> = (1..=WRITERS).map(|number| [0, 0, number, 0x03]).collect();
+    bed.bridge.wait_status("the publishers to match", |status| {
+        // Again and again, because the first ones may come before ingress knows the participant; a few in
+        // each message, which is one datagram.
+        for writers in writers.chunks(8) {
+            forger.announce(&Endpoint::writer(INPUT, SCAN_TYPE), writers);
+        }
+        status["routes"][0]["writers"].as_u64() == Some(u64::from(WRITERS) + 1)
+    });
+    for sequence in 1..=UNFINISHED {
+        for writer in &writers {
+            forger.write_unfinished(*writer, sequence..=sequence, 64_000);
+        }
+        // Leaves time for ingress, whose socket would discard most of it otherwise.
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    let begun = u64::from(WRITERS) * UNFINISHED as u64;
+    bed.bridge.wait_status("unfinished samples discarded", |status| {
+        refused(status, "ingress", "unfinished_sample") > begun / 2
+    });
+    let growth_kib = memory_kib(ingress, "VmHWM") - before_kib;
+    println!("ingress grew by {growth_kib} KiB");
+    assert!(growth_kib < MAX_GROWTH_KIB, "ingress grew by {growth_kib} KiB");
+
+    let sent: Sent = publisher.end();
+    critical.wait_received(sent.ok);
+    critical.end::<Received>().assert_all_of(&sent);
+    bed.wait_accounted();
+    bed.end();
 }
 
 /// Tests of a minute or more: `make test-long`.

@@ -2,6 +2,7 @@
 //! participant of the bridge.
 
 use std::net::SocketAddrV4;
+use std::ops::RangeInclusive;
 use std::sync::atomic::{AtomicI64, Ordering};
 
 use super::netns::{Host, udp_ports_of};
@@ -82,6 +83,16 @@ impl Forger {
         let end = Message::of(self.prefix).to(self.to);
         let end = end.heartbeat([0; 4], writer, sequence, sequence, sequence as i32);
         self.socket.send(&end, self.traffic());
+    }
+
+    /// Sends the first fragment only of samples of so many bytes, with these numbers.
+    pub fn write_unfinished(&self, writer: EntityId, numbers: RangeInclusive<i64>, sample_bytes: u32) {
+        let size = 60_000_u16;
+        for sequence in numbers {
+            let fragment = Fragment { number: 1, bytes: &[0; 60_000], sequence, size, sample_bytes };
+            let message = Message::of(self.prefix).to(self.to).fragment([0; 4], writer, &fragment);
+            self.socket.send(&message, self.traffic());
+        }
     }
 
     fn traffic(&self) -> SocketAddrV4 {
