@@ -1,7 +1,7 @@
 //! Chaos: processes of the bridge are killed and stopped at random, its configuration file is edited and
-//! reloaded, a second publisher comes and goes, and malformed datagrams arrive all along. At the end every
-//! sample of the publisher is forwarded, or dropped with a named reason, and all sums agree. With standbys
-//! and without.
+//! reloaded, a second publisher comes and goes, and malformed datagrams and announcements of participants
+//! that do not exist arrive all along. At the end every sample of the publisher is forwarded, or dropped with
+//! a named reason, and all sums agree. With standbys and without.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,12 +14,16 @@ use support::bed::{Bed, CRITICAL, INPUT, SCAN, STANDBYS, outputs};
 use support::netns::udp_ports;
 use support::peer::{Peer, Received, RunningPeer, Sent};
 
+use super::forged_participants;
 use super::hostile::{self, Random};
 
 /// How long the chaos lasts, in seconds; half an hour in `make soak`.
 const SECONDS: u64 = 40;
 const SECONDS_VARIABLE: &str = "ADAPTIVE_BRIDGE_TEST_CHAOS_S";
 const RATE_HZ: f64 = 200.0;
+/// 1,000 forged announcements a second: more than the 32 a second that a process admits, and few enough for
+/// the chaos to have the CPUs.
+const FORGED_DIVISOR: u32 = 16;
 const ROLES: [&str; 4] = ["ingress", "egress-critical", "egress-noncritical", "control"];
 /// The second processes of the roles that have a standby.
 const SECOND: [&str; 2] = ["ingress-2", "egress-critical-2"];
@@ -35,6 +39,12 @@ fn number(value: &Value) -> u64 {
 
 fn sum(counters: &Value) -> u64 {
     counters.as_object().unwrap().values().map(number).sum()
+}
+
+/// The account of the publisher that sent most.
+fn account_of(status: &Value) -> Value {
+    let accounts = status["routes"][0]["publishers"].as_array().unwrap();
+    accounts.iter().max_by_key(|account| number(&account["received"])).unwrap().clone()
 }
 
 struct Chaos<'b> {
@@ -153,6 +163,7 @@ mod long {
         let subscriber = bed.subscribe("critical", Peer::cyclone().keep_last(4_000), CRITICAL);
         let publisher = bed.publish(Peer::cyclone().keep_last(1_000).rate_hz(RATE_HZ), INPUT);
         subscriber.wait_received(200);
+        let first_sequence = account_of(&bed.bridge.status())["first_sequence"].clone();
 
         let seconds = std::env::var(SECONDS_VARIABLE).map_or(SECONDS, |text| text.parse().unwrap());
         let seed = u64::from(std::process::id()) | 1;
@@ -165,6 +176,9 @@ mod long {
                 let go_on = || !ended.load(Ordering::Relaxed);
                 attacker.within(|| hostile::send(address, &ports, seed, &[], go_on))
             });
+            let (socket, processes) = (attacker.udp_socket(), bed.discovery_addresses());
+            let goes_on = |_| !ended.load(Ordering::Relaxed);
+            scope.spawn(move || forged_participants::announce(&socket, &processes, FORGED_DIVISOR, goes_on));
             let random = Random(seed);
             let (visitor, events) = (None, BTreeMap::new());
             let mut chaos = Chaos { bed: &bed, with_standbys, random, visitor, visitors: 0, events };
@@ -180,16 +194,14 @@ mod long {
 
         let sent: Sent = publisher.end();
         sent.assert_not_blocked();
-        let account_of = |status: &Value| {
-            let accounts = status["routes"][0]["publishers"].as_array().unwrap();
-            accounts.iter().max_by_key(|account| number(&account["received"])).unwrap().clone()
-        };
         bed.bridge.wait_status("the last sample received by ingress", |status| {
             account_of(status)["last_sequence"].as_u64() == Some(sent.ok)
         });
         let status = bed.wait_accounted();
         let account = account_of(&status);
-        let before_first = number(&account["first_sequence"]) - 1;
+        // What it sent before it had discovered ingress, which no fault makes more.
+        assert_eq!(account["first_sequence"], first_sequence, "{account}");
+        let before_first = number(&first_sequence) - 1;
         let taken = number(&account["received"]) + number(&account["lost_upstream"]);
         assert_eq!(before_first + taken, sent.ok, "{sent:?} {account}");
         let route = &status["routes"][0];

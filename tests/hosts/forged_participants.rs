@@ -34,12 +34,13 @@ fn prefix(number: u32) -> Prefix {
     prefix
 }
 
-/// Announces participants to the processes of the bridge in turn: [`PARTICIPANTS`] within [`ATTACK`], and
-/// more until `stop`. Each fourth round, a participant that the processes know sends the announcement.
-fn announce(socket: &UdpSocket, processes: &[SocketAddrV4], stop: &AtomicBool) {
+/// Announces participants that do not exist to the processes of the bridge in turn: as many a second as are
+/// [`PARTICIPANTS`] within [`ATTACK`], divided by `divisor`, while `goes_on` says so of the number announced.
+/// Each fourth round, a participant that the processes know sends the announcement.
+pub fn announce(socket: &UdpSocket, processes: &[SocketAddrV4], divisor: u32, goes_on: impl Fn(u32) -> bool) {
     let begin = Instant::now();
     let mut number = 0;
-    while number < PARTICIPANTS || !stop.load(Ordering::Relaxed) {
+    while goes_on(number) {
         let (round, process) = (number as usize / processes.len(), number as usize % processes.len());
         let announced = prefix(number);
         // The first round announces the participants that the others name as their sender.
@@ -48,7 +49,7 @@ fn announce(socket: &UdpSocket, processes: &[SocketAddrV4], stop: &AtomicBool) {
         message.send(socket, processes[process]);
         number += 1;
         if number % 32 == 0 {
-            let due = ATTACK * number / PARTICIPANTS;
+            let due = ATTACK * number / PARTICIPANTS * divisor;
             std::thread::sleep(due.saturating_sub(begin.elapsed()));
         }
     }
@@ -132,7 +133,11 @@ mod long {
         let (socket, stop) = (bed.host("slow").udp_socket(), Arc::new(AtomicBool::new(false)));
         let attack = std::thread::spawn({
             let stop = Arc::clone(&stop);
-            move || announce(&socket, &processes, &stop)
+            move || {
+                announce(&socket, &processes, 1, |number| {
+                    number < PARTICIPANTS || !stop.load(Ordering::Relaxed)
+                })
+            }
         });
         let too_many = "too_many_participants";
         support::wait_until("refused announcements", || {

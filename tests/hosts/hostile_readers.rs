@@ -314,7 +314,7 @@ mod long {
         }
 
         let sent: Sent = publisher.end();
-        assert_eq!(sent.failed, 0, "the publisher was blocked: {sent:?}");
+        sent.assert_not_blocked();
         for subscriber in healthy {
             subscriber.wait_received(sent.ok);
             let received: Received = subscriber.end();
