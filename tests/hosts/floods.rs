@@ -119,7 +119,7 @@ fn control_goes_on_and_grows_little_during_a_flood_of_graph_entries() {
     let process = control.pid().as_raw();
     let before_kib = memory_kib(process, "VmHWM");
 
-    let forger = Forger::new(net.host("laptop"), 1, process);
+    let forger = Forger::new(net.host("laptop"), 1, (net.host("robot"), process));
     let graph = Endpoint::writer("ros_discovery_info", GRAPH_TYPE).transient_local();
     let reader = Endpoint::reader(INPUT, SCAN_TYPE);
     let small = Flood::new("small", forger.prefix(), 1, 8);
@@ -180,7 +180,7 @@ fn log_lines_that_a_peer_provokes_are_limited_and_those_left_out_are_counted() {
         (2, unmatched, "a reader requests a stricter QoS than this lane offers"),
     ] {
         // Each kind has a participant of its own, which may have 4,096 readers.
-        let forger = Forger::new(net.host("laptop"), kind, lane.pid().as_raw());
+        let forger = Forger::new(net.host("laptop"), kind, (net.host("robot"), lane.pid().as_raw()));
         let left_out_before = left_out(&lane.log());
         let provoked = || {
             let log = lane.log();

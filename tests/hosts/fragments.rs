@@ -63,7 +63,7 @@ fn samples_of_an_input_that_never_become_complete_take_little_memory() {
     let ingress = bed.pid("ingress");
     let before_kib = memory_kib(ingress, "VmHWM");
 
-    let forger = Forger::new(bed.host("slow"), 1, ingress);
+    let forger = Forger::new(bed.host("slow"), 1, (bed.host("bridge"), ingress));
     let writers: Vec<EntityId> = (1..=WRITERS).map(|number| [0, 0, number, 0x03]).collect();
     bed.bridge.wait_status("the publishers to match", |status| {
         // Again and again, because the first ones may come before ingress knows the participant; a few in

@@ -26,16 +26,19 @@ pub struct Forger {
 }
 
 impl Forger {
-    /// Creates it on a host, and waits until the participant of the process has announced itself to it;
-    /// `identity` distinguishes it from others.
-    pub fn new(host: &Host, identity: u8, process: i32) -> Self {
+    /// Creates it on a host, and waits until the participant of the process, which runs on the host `bridge`,
+    /// has announced itself to it; `identity` distinguishes it from others.
+    pub fn new(host: &Host, identity: u8, (bridge, process): (&Host, i32)) -> Self {
         let mut socket = ForgedReader::new(host, identity);
         let ports = udp_ports_of(process);
         let (to, announced) = wait_for(format!("the announcement of process {process}"), || {
             socket.announce_endpoint("rt/unused", "std_msgs::msg::dds_::String_");
             socket.receive();
             let mut participants = socket.announced().iter();
-            let is_of_process = |(_, one): &(&Prefix, &Announced)| ports.contains(&one.traffic.port());
+            // Participants on other hosts have the same ports.
+            let is_of_process = |(_, one): &(&Prefix, &Announced)| {
+                *one.traffic.ip() == bridge.address() && ports.contains(&one.traffic.port())
+            };
             participants.find(is_of_process).map(|(prefix, announced)| (*prefix, *announced))
         });
         // The socket has announced a reader with number 1.
