@@ -22,7 +22,7 @@ use super::rustdds::{
     SequenceNumber, Subscriber, ThreadTurns, Topic, TopicKind,
     dds::result::{CreateError, CreateResult},
 };
-use super::writer::RawWriter;
+use super::writer::{Matching, RawWriter};
 use crate::config::DdsNetwork;
 use crate::model::{
     DdsType, Durability, Encapsulation, Guid, History, MonotonicNs, NetworkRefusal, NetworkRefusals,
@@ -563,5 +563,6 @@ fn make_writer(
         ),
     };
     let inner = inner.map_err(|error| DdsError::library(format!("a writer of {topic}"), error))?;
-    Ok(RawWriter::new(inner))
+    let guid = Guid(inner.guid().to_bytes());
+    Ok(RawWriter { inner, guid, matching: Matching::default() })
 }

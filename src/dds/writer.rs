@@ -10,9 +10,8 @@ use super::qos;
 use super::reader::SampleOrigin;
 use super::rustdds::no_key::{DataWriter, SerializerAdapter};
 use super::rustdds::{
-    DataWriterStatus, GUID, InstanceChange, InstancePayload, RTPSEntity, RepresentationIdentifier,
-    SampleIdentity, SequenceNumber, StatusEvented, Timestamp, WriteOptionsBuilder,
-    dds::result::WriteError as DdsWriteError,
+    DataWriterStatus, GUID, InstanceChange, InstancePayload, RepresentationIdentifier, SampleIdentity,
+    SequenceNumber, StatusEvented, Timestamp, WriteOptionsBuilder, dds::result::WriteError as DdsWriteError,
 };
 use crate::model::{
     Encapsulation, Guid, KeyedPayload, ReaderRecord, SampleKey, SourceTimestamp, TypeHash, UnmatchedPolicy,
@@ -76,17 +75,12 @@ pub struct Written {
 
 /// A DDS writer of raw payloads.
 pub struct RawWriter {
-    inner: DataWriter<RawPayload, PayloadEncoder>,
-    guid: Guid,
-    matching: Matching,
+    pub(super) inner: DataWriter<RawPayload, PayloadEncoder>,
+    pub(super) guid: Guid,
+    pub(super) matching: Matching,
 }
 
 impl RawWriter {
-    pub(super) fn new(inner: DataWriter<RawPayload, PayloadEncoder>) -> Self {
-        let guid = Guid(inner.guid().to_bytes());
-        Self { inner, guid, matching: Matching::default() }
-    }
-
     /// The writer's GUID.
     pub fn guid(&self) -> Guid {
         self.guid
@@ -305,7 +299,7 @@ impl RawWriter {
 
 /// The readers that a writer has reported as matched.
 #[derive(Default)]
-struct Matching {
+pub(super) struct Matching {
     reported: BTreeSet<Guid>,
     /// Changes that the DDS library did not report, which [`note`](Self::note) has not noted yet.
     found: VecDeque<(Guid, bool)>,

@@ -640,7 +640,11 @@ fn a_new_reader_of_a_topic_does_not_get_what_a_former_one_has_taken() {
     assert_eq!(take_one(&former).unwrap().0, b"one.");
     drop(former);
     let reader = there.create_reader("rt/again", TYPE, &qos).unwrap();
-    wait_for_reader(&writer);
+    let give_up = Instant::now() + Duration::from_secs(20);
+    while !writer.matched_readers().any(|matched| matched.reader == reader.guid()) {
+        assert!(Instant::now() < give_up, "the new reader was not matched");
+        std::thread::sleep(Duration::from_millis(5));
+    }
     write(b"two.");
     assert_eq!(take_one(&reader).unwrap().0, b"two.");
 }

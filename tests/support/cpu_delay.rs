@@ -1,4 +1,5 @@
-//! Measures for how long the hypervisor, firmware or the kernel kept a CPU from its thread of highest priority.
+//! Measures for how long the hypervisor, firmware or the kernel kept a CPU from its thread of highest
+//! priority.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};

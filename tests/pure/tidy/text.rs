@@ -33,8 +33,9 @@ const UNSAFE: &[&str] = &[
     "tests/support/process.rs",
     // A thread that is traced, and so stopped by itself.
     "tests/support/machine.rs",
-    // Scheduling of the benchmark, and an allocator that counts.
+    // Scheduling of the benchmark and of a thread of its soak, and an allocator that counts.
     "benches/hop/system.rs",
+    "tests/support/cpu_delay.rs",
     "tests/dds/allocations.rs",
     "tests/shm/main.rs",
 ];
