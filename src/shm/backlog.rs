@@ -129,7 +129,9 @@ impl BacklogKeeper {
     }
 }
 
-/// Copies the samples of a route with these sequence numbers that ingress keeps, in order.
+/// Copies the samples of a route with these sequence numbers that ingress keeps, in order. The caller must
+/// know that all of `wanted` were published, by a sample that it has received: of a later one, ingress may
+/// have written the number to the header, and not the rest yet.
 ///
 /// # Errors
 /// The pool cannot be opened, for example because ingress has ended.

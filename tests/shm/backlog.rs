@@ -1,7 +1,7 @@
 //! The backlog of a route: what ingress keeps for a lane that restarts.
 
 use std::ops::Range;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
 
 use adaptive_bridge::shm::{
@@ -135,12 +135,14 @@ fn a_backlog_is_read_while_its_slots_are_written_again() {
     let node = place.node();
     let mut route = Route::open(&node, &backlogged(1 << 20), u64::MAX);
     let boards = route.boards.clone();
-    let (samples, ends) = (AtomicUsize::new(0), AtomicBool::new(false));
+    let (samples, published, ends) = (AtomicUsize::new(0), AtomicU64::new(0), AtomicBool::new(false));
     std::thread::scope(|scope| {
         let reader = scope.spawn(|| {
             let mut reads = 0;
             while !ends.load(Ordering::Relaxed) {
-                samples.fetch_add(sequences(&boards, 1..u64::MAX).len(), Ordering::Relaxed);
+                // Of a later sample, a part of the header may have been written.
+                let wanted = 1..published.load(Ordering::Acquire) + 1;
+                samples.fetch_add(sequences(&boards, wanted).len(), Ordering::Relaxed);
                 reads += 1;
             }
             reads
@@ -151,6 +153,7 @@ fn a_backlog_is_read_while_its_slots_are_written_again() {
             sequence += 1;
             assert!(sequence <= 1_000_000, "no sample was read while samples were written");
             route.publish(sequence, 900 + sequence as usize % 200);
+            published.store(sequence, Ordering::Release);
             if sequence.is_multiple_of(50) {
                 std::thread::sleep(Duration::from_micros(100));
             }
