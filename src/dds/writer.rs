@@ -283,6 +283,11 @@ impl RawWriter {
                 Some(_) => None,
                 None => {
                     if self.inner.has_missed_events() {
+                        // The events that came meanwhile are older than the readers that are looked at then.
+                        self.matching.is_incomplete = true;
+                        continue;
+                    }
+                    if std::mem::take(&mut self.matching.is_incomplete) {
                         let matched = self.inner.matched_readers();
                         self.matching.compare(matched.iter().map(|reader| Guid(reader.guid.to_bytes())));
                     }
@@ -301,6 +306,8 @@ impl RawWriter {
 #[derive(Default)]
 pub(super) struct Matching {
     reported: BTreeSet<Guid>,
+    /// Whether the DDS library has not reported a change since the last comparison.
+    is_incomplete: bool,
     /// Changes that the DDS library did not report, which [`note`](Self::note) has not noted yet.
     found: VecDeque<(Guid, bool)>,
 }
@@ -309,6 +316,8 @@ impl Matching {
     /// Notes a change, and returns its event, unless it is the end of a match that was not reported. A match
     /// that was reported is a change, too: the end of the one before may be among those without a report.
     fn note(&mut self, reader: Guid, joined: bool, missed: u64) -> Option<WriterEvent> {
+        // This is newer than what was found of the reader.
+        self.found.retain(|(found, _)| *found != reader);
         let was_reported = if joined { !self.reported.insert(reader) } else { self.reported.remove(&reader) };
         let readers = self.reported.len() as u64;
         (joined || was_reported).then_some(WriterEvent::Matched { reader, joined, readers, missed })
@@ -379,4 +388,23 @@ fn with_key(options: WriteOptionsBuilder, key: SampleKey) -> WriteOptionsBuilder
         KeyedPayload::Absent => InstancePayload::Absent,
     };
     options.instance_change(InstanceChange { key_hash: key.hash(), status_info: key.status_info(), payload })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_event_counts_more_than_what_was_found_before_it() {
+        let [one, two, three] = [1, 2, 3].map(|number| Guid([number; 16]));
+        let mut matching = Matching::default();
+        assert!(matching.note(one, true, 0).is_some());
+        matching.compare([two, three].into_iter());
+        assert_eq!(matching.found, [(one, false), (two, true), (three, true)]);
+        assert!(matching.note(three, false, 0).is_none(), "it was not reported");
+        assert!(matching.note(one, true, 0).is_some());
+        assert_eq!(matching.found, [(two, true)]);
+        matching.compare([one].into_iter());
+        assert!(matching.found.is_empty());
+    }
 }

@@ -735,7 +735,7 @@ impl RtpsReaderProxy {
     self.sent_whole_from = first;
   }
 
-  /// Whether every fragment of the sample was sent to the reader.
+  /// Whether no fragment of the sample was withheld from the reader, if it was sent.
   pub fn was_sent_whole(&self, sn: SequenceNumber) -> bool {
     self.sent_whole_from <= sn
   }

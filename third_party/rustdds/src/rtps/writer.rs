@@ -1628,7 +1628,7 @@ impl Writer {
         // together are served by one repair round. If a round is already
         // pending, it also serves what this ACKNACK requested.
         if start_repair {
-          if let Some(sn) = self.requests_large_sample(an) {
+          if let Some(sn) = self.requests_large_sample(reader_guid, an) {
             self.send_small_datagrams_to(reader_guid, sn);
           }
           self.schedule_repair_data(reader_guid, self.nack_response_delay);
@@ -1798,13 +1798,16 @@ impl Writer {
     }
   }
 
-  // The first sample that is requested as a whole, if it is a large one: none of its
-  // datagrams has arrived, as where the path drops every packet of a split datagram.
-  fn requests_large_sample(&self, an: &AckNack) -> Option<SequenceNumber> {
+  // The first sample that was sent whole to the reader, and that it requests as a whole, if
+  // it is a large one: none of its datagrams has arrived, as where the path drops every
+  // packet of a split datagram.
+  fn requests_large_sample(&self, reader_guid: GUID, an: &AckNack) -> Option<SequenceNumber> {
     if an.reader_sn_state.base() > self.last_sent() {
       return None;
     }
-    let first = an.reader_sn_state.iter().next()?;
+    let reader = self.readers.get(&reader_guid)?;
+    let mut requested = an.reader_sn_state.iter();
+    let first = requested.find(|sn| reader.was_sent_whole(*sn))?;
     let payload_size = self.send_buffer.get_by_sn(first)?.data_value.payload_size();
     (payload_size >= LARGE_SAMPLE_BYTES).then_some(first)
   }
@@ -4107,23 +4110,25 @@ mod tests {
         frags_per_datafrag(header, budget(f, payload_size), 1, num_frags, size, payload_size)
       };
       assert_eq!((per_datagram(&f, 60_000), per_datagram(&f, 1_000_000)), (1, 10));
-      // The reader was matched after the sample was sent.
-      nack_frag(&mut f, 1, frags(10..=30), 4);
-      f.ack_nack(1..=1, 2);
-      assert_eq!(per_datagram(&f, 1_000_000), 10);
-      let first = SequenceNumber::new(1);
-      f.writer.readers.values_mut().for_each(|reader| reader.send_whole_from(first));
+      // The reader was matched after sample 1 was sent, and sample 2 may have been begun then.
+      write(&f, 2, 1_000_000);
+      f.writer.set_last_sent(SequenceNumber::new(3));
+      for sn in 1..=2 {
+        nack_frag(&mut f, sn, frags(10..=30), sn as i32);
+        f.ack_nack([sn], sn as i32);
+        assert_eq!(per_datagram(&f, 1_000_000), 10, "{sn}");
+      }
       // What does not fit the reader's receive buffer, and what does not exist.
-      nack_frag(&mut f, 1, frags(100..=300), 1);
-      nack_frag(&mut f, 1, all_from(u32::MAX - 3), 3);
+      nack_frag(&mut f, 3, frags(100..=300), 3);
+      nack_frag(&mut f, 3, all_from(u32::MAX - 3), 4);
       assert_eq!(per_datagram(&f, 1_000_000), 10);
-      nack_frag(&mut f, 1, frags(10..=30), 2);
+      nack_frag(&mut f, 3, frags(10..=30), 5);
       assert_eq!(per_datagram(&f, 1_000_000), 1);
       let later = Instant::now() + crate::rtps::constant::SMALL_DATAGRAMS_PERIOD;
       f.writer.readers.values_mut().for_each(|reader| reader.retry_large_datagrams(later));
       assert_eq!(per_datagram(&f, 1_000_000), 10);
       // Where no packet of a split datagram arrives, the whole sample is requested.
-      f.ack_nack(1..=1, 1);
+      f.ack_nack([2, 3], 3);
       assert_eq!(per_datagram(&f, 1_000_000), 1);
     }
 
@@ -4491,6 +4496,9 @@ mod tests {
         assert_eq!(f.unsent(), 0);
         acknowledge(&mut f, first, &[], 2);
         assert!(!f.reader_proxy().is_joining());
+        // The sample after the last one may have been begun.
+        let was_sent_whole = |sn| f.reader_proxy().was_sent_whole(SequenceNumber::new(sn));
+        assert!(!was_sent_whole(first + 3) && was_sent_whole(first + 4));
         assert_eq!(received_messages(&socket), (0, vec![(first, first + 2)]));
         assert_eq!(f.repair_round(), 3);
         assert_eq!(received_messages(&socket).0, 3);
