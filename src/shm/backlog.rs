@@ -129,9 +129,9 @@ impl BacklogKeeper {
     }
 }
 
-/// Copies the samples of a route with these sequence numbers that ingress keeps, in order. The caller must
-/// know that all of `wanted` were published, by a sample that it has received: of a later one, ingress may
-/// have written the number to the header, and not the rest yet.
+/// Copies the samples of a route with these sequence numbers that ingress keeps, in order. All of `wanted`
+/// must be numbers of published samples, at most that of one which the caller, or the process that it
+/// continues, has received: the header of a later sample may have its number already, and not the rest.
 ///
 /// # Errors
 /// The pool cannot be opened, for example because ingress has ended.

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
 
 use adaptive_bridge::config::DdsNetwork;
-use adaptive_bridge::dds::{Kept, Participant, ParticipantOptions, RawWriter, ReaderQos};
+use adaptive_bridge::dds::{Kept, Participant, ParticipantOptions, RawWriter, ReaderQos, WriterEvent};
 use adaptive_bridge::model::{Durability, Encapsulation, Guid, QosProfile, Reliability, SourceTimestamp};
 use bytes::Bytes;
 use support::bed::{is_accounted_and_idle, outputs};
@@ -48,8 +48,9 @@ fn write(writer: &RawWriter) {
         .unwrap();
 }
 
-fn wait_matched(writer: &RawWriter) {
-    wait_until("a reader", || writer.matched_readers().next().is_some());
+/// Waits for the event, which comes when the writer also waits for acknowledgements of the reader.
+fn wait_matched(writer: &mut RawWriter) {
+    wait_until("a reader", || matches!(writer.poll_event(), Some(WriterEvent::Matched { joined: true, .. })));
 }
 
 #[test]
@@ -66,10 +67,10 @@ fn a_lane_sends_what_waits_on_the_route_of_the_higher_priority_first() {
     let noncritical = bridge.start("egress --lane noncritical");
     let network = DdsNetwork::of_domain(87);
     let mut publisher = Participant::open(&options("publisher", &network)).unwrap();
-    let bulk = publisher.create_writer("rt/bulk", TYPE, &QosProfile::CRITICAL, 100).unwrap();
-    let stop = publisher.create_writer("rt/stop", TYPE, &QosProfile::CRITICAL, 100).unwrap();
-    wait_matched(&bulk);
-    wait_matched(&stop);
+    let mut bulk = publisher.create_writer("rt/bulk", TYPE, &QosProfile::CRITICAL, 100).unwrap();
+    let mut stop = publisher.create_writer("rt/stop", TYPE, &QosProfile::CRITICAL, 100).unwrap();
+    wait_matched(&mut bulk);
+    wait_matched(&mut stop);
     let (on_arriving, order) = recorder();
     let mut subscriber = Participant::open_receiving(
         &options("subscriber", &network),
@@ -152,10 +153,10 @@ fn ingress_receives_the_routes_of_higher_priorities_before_what_arrived_earlier(
     let _bulk_reader = there.create_reader("rt/bulk", TYPE, &qos(Reliability::Reliable)).unwrap();
     let _stop_reader = there.create_reader("rt/stop", TYPE, &qos(Reliability::Reliable)).unwrap();
     let mut here = Participant::open(&options("here", &network)).unwrap();
-    let bulk = here.create_writer("rt/bulk", TYPE, &QosProfile::CRITICAL, 100).unwrap();
-    let stop = here.create_writer("rt/stop", TYPE, &QosProfile::CRITICAL, 100).unwrap();
-    wait_matched(&bulk);
-    wait_matched(&stop);
+    let mut bulk = here.create_writer("rt/bulk", TYPE, &QosProfile::CRITICAL, 100).unwrap();
+    let mut stop = here.create_writer("rt/stop", TYPE, &QosProfile::CRITICAL, 100).unwrap();
+    wait_matched(&mut bulk);
+    wait_matched(&mut stop);
     // The readers are no longer joining when they have acknowledged a sample.
     for writer in [&bulk, &stop] {
         write(writer);

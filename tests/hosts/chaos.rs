@@ -11,6 +11,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN, STANDBYS, outputs};
+use support::bridge::refused;
 use support::netns::udp_ports;
 use support::peer::{Peer, Received, RunningPeer, Sent};
 
@@ -21,8 +22,8 @@ use super::hostile::{self, Random};
 const SECONDS: u64 = 40;
 const SECONDS_VARIABLE: &str = "ADAPTIVE_BRIDGE_TEST_CHAOS_S";
 const RATE_HZ: f64 = 200.0;
-/// 1,000 forged announcements a second: more than the 32 a second that a process admits, and few enough for
-/// the chaos to have the CPUs.
+/// Some 1,000 forged announcements a second in all, 260 for each of four processes, which admits 32: few
+/// enough to leave the CPUs to the chaos.
 const FORGED_DIVISOR: u32 = 16;
 const ROLES: [&str; 4] = ["ingress", "egress-critical", "egress-noncritical", "control"];
 /// The second processes of the roles that have a standby.
@@ -171,12 +172,12 @@ mod long {
         let ports = udp_ports(bed.pid("ingress"));
         let ended = AtomicBool::new(false);
         let (address, attacker) = (bed.host("bridge").address(), bed.host("slow"));
+        let (socket, processes) = (attacker.udp_socket(), bed.discovery_addresses());
         std::thread::scope(|scope| {
             scope.spawn(|| {
                 let go_on = || !ended.load(Ordering::Relaxed);
                 attacker.within(|| hostile::send(address, &ports, seed, &[], go_on))
             });
-            let (socket, processes) = (attacker.udp_socket(), bed.discovery_addresses());
             let goes_on = |_| !ended.load(Ordering::Relaxed);
             scope.spawn(move || forged_participants::announce(&socket, &processes, FORGED_DIVISOR, goes_on));
             let random = Random(seed);
@@ -198,8 +199,10 @@ mod long {
             account_of(status)["last_sequence"].as_u64() == Some(sent.ok)
         });
         let status = bed.wait_accounted();
+        let refused = ROLES.map(|role| refused(&status, role, "too_many_participants"));
+        assert!(refused.iter().any(|refused| *refused > 0), "no forged announcement has arrived");
         let account = account_of(&status);
-        // What it sent before it had discovered ingress, which no fault makes more.
+        // What it sent before it had discovered ingress: no fault adds to it.
         assert_eq!(account["first_sequence"], first_sequence, "{account}");
         let before_first = number(&first_sequence) - 1;
         let taken = number(&account["received"]) + number(&account["lost_upstream"]);

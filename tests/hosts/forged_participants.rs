@@ -35,7 +35,8 @@ fn prefix(number: u32) -> Prefix {
 }
 
 /// Announces participants that do not exist to the processes of the bridge in turn: as many a second as are
-/// [`PARTICIPANTS`] within [`ATTACK`], divided by `divisor`, while `goes_on` says so of the number announced.
+/// [`PARTICIPANTS`] within [`ATTACK`], divided by `divisor`, as long as `goes_on`, called with the number
+/// announced so far, returns true.
 /// Each fourth round, a participant that the processes know sends the announcement.
 pub fn announce(socket: &UdpSocket, processes: &[SocketAddrV4], divisor: u32, goes_on: impl Fn(u32) -> bool) {
     let begin = Instant::now();

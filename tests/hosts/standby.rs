@@ -269,7 +269,7 @@ mod long {
         let mut random = Random(u64::from(std::process::id()) | 1);
         println!("seed {}", random.0);
         let until = Instant::now() + Duration::from_secs(seconds);
-        let (monitor, mut delays) = (CpuDelayMonitor::start(), Vec::new());
+        let monitor = CpuDelayMonitor::start();
         let mut faults = Vec::new();
         while Instant::now() < until {
             std::thread::sleep(Duration::from_millis(2_000 + random.below(8_000) as u64));
@@ -292,7 +292,6 @@ mod long {
                 std::thread::sleep(Duration::from_millis(random.below(4_000) as u64));
                 let _ = kill(pid, Signal::SIGCONT);
             }
-            delays.extend(monitor.take());
         }
         let stops = faults.iter().filter(|(.., sent)| *sent == Signal::SIGSTOP).count();
         println!("{} killed, {stops} stopped", faults.len() - stops);
@@ -302,10 +301,12 @@ mod long {
         let sent = publishers.map(|publisher| {
             let sent: Sent = publisher.end();
             sent.assert_not_blocked();
-            println!("longest write {:.1} ms", sent.call_us.map_or(0.0, |calls| calls.max / 1e3));
+            let longest_ms = sent.call_us.as_ref().map_or(0.0, |calls| calls.max / 1e3);
+            println!("longest write {longest_ms:.1} ms");
             sent
         });
         bed.wait_accounted();
+        let delays = monitor.take();
         for (name, subscriber) in subscribers {
             let sent = &sent[usize::from(name.ends_with("MiB"))];
             subscriber
@@ -327,8 +328,8 @@ mod long {
         format!("pauses: p99 {:.1}, p99.9 {:.1}, max {:.1} ms", at(0.99), at(0.999), at(1.0))
     }
 
-    /// Lists the pauses that are longer than the goal, each with the fault before it and with how long the
-    /// machine kept the CPUs from a thread of the highest priority meanwhile.
+    /// Lists the pauses that are longer than the goal, each with the last fault before its end, and with how
+    /// long a CPU did not run a thread of the highest priority meanwhile.
     fn list_pauses(subscriber: &RunningPeer, faults: &[(MonotonicNs, String, Signal)], delays: &[CpuDelay]) {
         const GOAL_NS: u64 = 20_000_000;
         let wall_ns = clock::wall().0 - clock::monotonic().0;
@@ -340,16 +341,24 @@ mod long {
             })
             .collect();
         let ms = |ns: u64| ns as f64 / 1e6;
+        let cpus = delays.iter().map(|delay| delay.cpu + 1).max().unwrap_or(0);
         for pair in arrivals.windows(2).filter(|pair| pair[1].since(pair[0]) > GOAL_NS) {
             let (from, to) = (pair[0], pair[1]);
-            let delay_ns: u64 = delays.iter().map(|delay| delay.ns_between(from, to)).sum();
-            let fault = faults.iter().rev().find(|(at, ..)| *at < to);
-            let fault = fault.map_or_else(
-                || "before all faults".to_owned(),
-                |(at, what, _)| format!("{:.1} ms after {what}", (from.0 as f64 - at.0 as f64) / 1e6),
-            );
+            let of_cpu = |cpu| {
+                let of_cpu = delays.iter().filter(|delay| delay.cpu == cpu);
+                of_cpu.map(|delay| delay.ns_between(from, to)).sum::<u64>()
+            };
+            let delay_ns = (0..cpus).map(of_cpu).max().unwrap_or(0);
+            let fault = match faults.iter().rev().find(|(at, ..)| *at < to) {
+                None => "began before all faults".to_owned(),
+                Some((at, what, _)) if *at < from => {
+                    format!("began {:.1} ms after {what}", ms(from.since(*at)))
+                }
+                Some((at, what, _)) => format!("had {what} {:.1} ms after its begin", ms(at.since(from))),
+            };
             println!(
-                "pause of {:.1} ms, which began {fault}; the CPUs were kept from the control thread for {:.1} ms of it",
+                "pause of {:.1} ms, which {fault}; a CPU did not run a thread of the highest priority for \
+                 {:.1} ms of it",
                 ms(to.since(from)),
                 ms(delay_ns)
             );

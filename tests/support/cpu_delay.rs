@@ -2,7 +2,7 @@
 //! priority.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
 use adaptive_bridge::clock;
@@ -41,7 +41,7 @@ impl CpuDelay {
 }
 
 /// Measures the delays of each CPU with a thread that sleeps and compares its wake-up with the due time. The
-/// threads end with the process.
+/// threads end with the monitor.
 pub struct CpuDelayMonitor(Arc<Mutex<Vec<CpuDelay>>>);
 
 impl CpuDelayMonitor {
@@ -49,7 +49,7 @@ impl CpuDelayMonitor {
         let allowed = sched_getaffinity(Pid::from_raw(0)).unwrap_or_else(|_| CpuSet::new());
         let delays = Arc::default();
         for cpu in (0..CpuSet::count()).filter(|&cpu| allowed.is_set(cpu).unwrap_or(false)) {
-            let delays = Arc::clone(&delays);
+            let delays = Arc::downgrade(&delays);
             std::thread::spawn(move || measure(cpu, &delays));
         }
         Self(delays)
@@ -73,14 +73,16 @@ impl CpuDelayMonitor {
     }
 }
 
-fn measure(cpu: usize, delays: &Mutex<Vec<CpuDelay>>) {
+fn measure(cpu: usize, delays: &Weak<Mutex<Vec<CpuDelay>>>) {
     run_with_highest_priority_on(cpu);
-    loop {
+    while delays.strong_count() > 0 {
         let due = clock::monotonic().0 + PERIOD.as_nanos() as u64;
         std::thread::sleep(PERIOD);
         let now = clock::monotonic();
         let ns = now.0.saturating_sub(due);
-        if ns >= MIN_DELAY_NS {
+        if ns >= MIN_DELAY_NS
+            && let Some(delays) = delays.upgrade()
+        {
             let delay = CpuDelay { cpu, until: now, ns };
             delays.lock().unwrap_or_else(PoisonError::into_inner).push(delay);
         }

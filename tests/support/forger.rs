@@ -2,7 +2,6 @@
 //! participant of the bridge.
 
 use std::net::SocketAddrV4;
-use std::ops::RangeInclusive;
 use std::sync::atomic::{AtomicI64, Ordering};
 
 use super::netns::{Host, udp_ports_of};
@@ -14,8 +13,8 @@ use super::wait_for;
 
 /// A forged participant. What it sends is for the participant of one process.
 ///
-/// Every message ends with a heartbeat that says that earlier samples of the writer are no longer available,
-/// so that a lost datagram delays none of the following ones.
+/// Announcements and complete samples end with a heartbeat that says that earlier samples of the writer are
+/// no longer available, so that a lost datagram delays none of the following ones.
 pub struct Forger {
     socket: ForgedReader,
     prefix: Prefix,
@@ -88,14 +87,11 @@ impl Forger {
         self.socket.send(&end, self.traffic());
     }
 
-    /// Sends the first fragment only of samples of so many bytes, with these numbers.
-    pub fn write_unfinished(&self, writer: EntityId, numbers: RangeInclusive<i64>, sample_bytes: u32) {
-        let size = 60_000_u16;
-        for sequence in numbers {
-            let fragment = Fragment { number: 1, bytes: &[0; 60_000], sequence, size, sample_bytes };
-            let message = Message::of(self.prefix).to(self.to).fragment([0; 4], writer, &fragment);
-            self.socket.send(&message, self.traffic());
-        }
+    /// Sends only the first fragment of a sample that has `sample_bytes` bytes, at least 60,000.
+    pub fn write_unfinished(&self, writer: EntityId, sequence: i64, sample_bytes: u32) {
+        let fragment = Fragment { number: 1, bytes: &[0; 60_000], sequence, size: 60_000, sample_bytes };
+        let message = Message::of(self.prefix).to(self.to).fragment([0; 4], writer, &fragment);
+        self.socket.send(&message, self.traffic());
     }
 
     fn traffic(&self) -> SocketAddrV4 {

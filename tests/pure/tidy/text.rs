@@ -33,7 +33,7 @@ const UNSAFE: &[&str] = &[
     "tests/support/process.rs",
     // A thread that is traced, and so stopped by itself.
     "tests/support/machine.rs",
-    // Scheduling of the benchmark and of a thread of its soak, and an allocator that counts.
+    // Scheduling of the benchmark and of threads that measure delays of CPUs, and an allocator that counts.
     "benches/hop/system.rs",
     "tests/support/cpu_delay.rs",
     "tests/dds/allocations.rs",
