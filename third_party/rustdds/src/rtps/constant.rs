@@ -97,8 +97,9 @@ pub const LARGE_SAMPLE_BYTES: usize = 64 * 1024;
 pub const LARGE_SAMPLE_DATAGRAM: usize = 10 * FRAGMENT_SIZE + 160;
 
 // A reader that requests half of the first fragments of a large sample, or the sample as a
-// whole, although all of it was sent to the reader, gets such samples in datagrams of one packet for this long. 40 fragments are 54 KB, a quarter of the
-// kernel's default receive buffer.
+// whole, although all of it was sent to the reader, gets such samples in datagrams of one
+// packet for this long. 40 fragments are 54 KB, a quarter of the kernel's default receive
+// buffer.
 pub const OBSERVED_FRAGMENTS: u32 = 40;
 pub const SMALL_DATAGRAMS_PERIOD: Duration = Duration::from_secs(5);
 

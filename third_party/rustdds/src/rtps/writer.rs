@@ -1628,8 +1628,8 @@ impl Writer {
         // together are served by one repair round. If a round is already
         // pending, it also serves what this ACKNACK requested.
         if start_repair {
-          if let Some(sn) = self.requests_large_sample(reader_guid, an) {
-            self.send_small_datagrams_to(reader_guid, sn);
+          if self.requests_large_sample(reader_guid, an) {
+            self.send_small_datagrams_to(reader_guid_prefix);
           }
           self.schedule_repair_data(reader_guid, self.nack_response_delay);
         }
@@ -1781,8 +1781,11 @@ impl Writer {
           return;
         };
         let (fragment_count, _) = self.num_frags_and_frag_size(cc.data_value.payload_size());
-        if RtpsReaderProxy::shows_loss(&nackfrag.fragment_number_state, fragment_count) {
-          self.send_small_datagrams_to(reader_guid, nackfrag.writer_sn);
+        let was_sent_whole = |reader: &RtpsReaderProxy| reader.was_sent_whole(nackfrag.writer_sn);
+        if RtpsReaderProxy::shows_loss(&nackfrag.fragment_number_state, fragment_count)
+          && self.readers.get(&reader_guid).is_some_and(was_sent_whole)
+        {
+          self.send_small_datagrams_to(reader_guid_prefix);
         }
         if let Some(reader_proxy) = self.lookup_reader_proxy_mut(reader_guid) {
           reader_proxy.mark_frags_requested(
@@ -1798,31 +1801,29 @@ impl Writer {
     }
   }
 
-  // The first sample that was sent whole to the reader, and that it requests as a whole, if
-  // it is a large one: none of its datagrams has arrived, as where the path drops every
+  // Whether the first sample that was sent whole to the reader, and that it requests as a
+  // whole, is a large one: none of its datagrams has arrived, as where the path drops every
   // packet of a split datagram.
-  fn requests_large_sample(&self, reader_guid: GUID, an: &AckNack) -> Option<SequenceNumber> {
-    if an.reader_sn_state.base() > self.last_sent() {
-      return None;
-    }
-    let reader = self.readers.get(&reader_guid)?;
-    let mut requested = an.reader_sn_state.iter();
-    let first = requested.find(|sn| reader.was_sent_whole(*sn))?;
-    let payload_size = self.send_buffer.get_by_sn(first)?.data_value.payload_size();
-    (payload_size >= LARGE_SAMPLE_BYTES).then_some(first)
+  fn requests_large_sample(&self, reader_guid: GUID, an: &AckNack) -> bool {
+    let Some(reader) = self.readers.get(&reader_guid) else {
+      return false;
+    };
+    let first = (an.reader_sn_state.base() <= self.last_sent())
+      .then(|| an.reader_sn_state.iter().find(|sn| reader.was_sent_whole(*sn)))
+      .flatten();
+    first
+      .and_then(|sn| self.send_buffer.get_by_sn(sn))
+      .is_some_and(|cc| cc.data_value.payload_size() >= LARGE_SAMPLE_BYTES)
   }
 
-  // The path to the participant of a reader loses packets, if all of that sample was sent
-  // to it. All readers of a participant are reached over the same path, and those at the
-  // same address share datagrams.
-  fn send_small_datagrams_to(&mut self, reader_guid: GUID, sn: SequenceNumber) {
-    let was_sent_whole = |reader: &RtpsReaderProxy| reader.was_sent_whole(sn);
-    if !self.readers.get(&reader_guid).is_some_and(was_sent_whole) {
-      return;
-    }
+  // All readers of a participant are reached over the same path, and those at the same
+  // address share datagrams.
+  fn send_small_datagrams_to(&mut self, participant: GuidPrefix) {
     let now = Instant::now();
-    let of_participant = self.readers.range_mut(reader_guid.prefix.range());
-    of_participant.for_each(|(_, reader)| reader.send_small_datagrams(now));
+    let readers = self.readers.values_mut();
+    readers
+      .filter(|reader| reader.remote_reader_guid.prefix == participant)
+      .for_each(|reader| reader.send_small_datagrams(now));
   }
 
   // The first sample of which a reader that is sent to from now on gets every fragment: the
