@@ -2364,6 +2364,45 @@ mod tests {
       DomainParticipantStatusEvent::ParticipantLost { id, reason: LostReason::Disposed } if *id == prefix)));
   }
 
+  // When announcements of the participant arrive until then, and whether each is a goodbye.
+  #[cfg(not(feature = "security"))]
+  fn arrivals(
+    socket: &std::net::UdpSocket,
+    of: GUID,
+    until: std::time::Instant,
+  ) -> Vec<(std::time::Instant, bool)> {
+    use std::time::Instant;
+
+    use crate::{
+      messages::submessages::submessage_flag::DATA_Flags,
+      rtps::{submessage::SubmessageBody, Message},
+    };
+
+    let mut arrivals = Vec::new();
+    let mut buffer = [0; 4096];
+    loop {
+      let left = until.saturating_duration_since(Instant::now());
+      if left.is_zero() {
+        return arrivals;
+      }
+      socket.set_read_timeout(Some(left)).unwrap();
+      let Ok((length, _)) = socket.recv_from(&mut buffer) else {
+        return arrivals;
+      };
+      let now = Instant::now();
+      let message = Message::read_from_buffer(&bytes::Bytes::copy_from_slice(&buffer[..length])).unwrap();
+      for submessage in &message.submessages {
+        if let SubmessageBody::Writer(WriterSubmessage::Data(data, flags)) = &submessage.body {
+          if message.header.guid_prefix == of.prefix
+            && data.writer_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER
+          {
+            arrivals.push((now, !flags.contains(DATA_Flags::Data)));
+          }
+        }
+      }
+    }
+  }
+
   // Fast DDS handles multicast and unicast in two threads. The goodbye is due when the next announcement to
   // all is.
   #[test]
@@ -2375,41 +2414,11 @@ mod tests {
     };
 
     use crate::{
-      discovery::discovery::DiscoveryCommand,
-      messages::submessages::submessage_flag::DATA_Flags,
-      rtps::{submessage::SubmessageBody, Message},
-      test::test_data::spdp_participant_msg_mod,
+      discovery::discovery::DiscoveryCommand, test::test_data::spdp_participant_msg_mod,
     };
 
     const PERIOD: Duration = Duration::from_secs(2);
     const APART: Duration = Duration::from_millis(50);
-
-    // When announcements of the participant arrive until then, and whether each is a goodbye.
-    fn arrivals(socket: &UdpSocket, of: GUID, until: Instant) -> Vec<(Instant, bool)> {
-      let mut arrivals = Vec::new();
-      let mut buffer = [0; 4096];
-      loop {
-        let left = until.saturating_duration_since(Instant::now());
-        if left.is_zero() {
-          return arrivals;
-        }
-        socket.set_read_timeout(Some(left)).unwrap();
-        let Ok((length, _)) = socket.recv_from(&mut buffer) else {
-          return arrivals;
-        };
-        let now = Instant::now();
-        let message = Message::read_from_buffer(&bytes::Bytes::copy_from_slice(&buffer[..length])).unwrap();
-        for submessage in &message.submessages {
-          if let SubmessageBody::Writer(WriterSubmessage::Data(data, flags)) = &submessage.body {
-            if message.header.guid_prefix == of.prefix
-              && data.writer_id == EntityId::SPDP_BUILTIN_PARTICIPANT_WRITER
-            {
-              arrivals.push((now, !flags.contains(DATA_Flags::Data)));
-            }
-          }
-        }
-      }
-    }
 
     let domain = test_domain_id(40);
     let bind = |port| UdpSocket::bind(("127.0.0.1", port)).unwrap();
@@ -2446,6 +2455,40 @@ mod tests {
       }
     }
     panic!("an announcement comes with each goodbye");
+  }
+
+  // It has just matched the Writers of this one, and would match them again after a goodbye.
+  #[test]
+  #[cfg(not(feature = "security"))]
+  fn a_participant_that_comes_back_by_itself_is_told_no_goodbye() {
+    use std::{
+      net::UdpSocket,
+      time::{Duration, Instant},
+    };
+
+    use crate::{
+      discovery::discovery::DiscoveryCommand, test::test_data::spdp_participant_msg_mod,
+    };
+
+    let domain = test_domain_id(17);
+    let bind = |port| UdpSocket::bind(("127.0.0.1", port)).unwrap();
+    let (returning, neighbour) = (bind(0), bind(spdp_well_known_unicast_port(domain, 5)));
+    let participant = DomainParticipant::new(domain).unwrap();
+    let own = participant.guid();
+    while arrivals(&neighbour, own, Instant::now() + Duration::from_millis(20)).is_empty() {}
+    let announcement = spdp_participant_msg_mod(returning.local_addr().unwrap().port());
+    let prefix = announcement.header.guid_prefix;
+    let datagram = announcement.write_to_vec_with_ctx(Endianness::LittleEndian).unwrap();
+    let command = DiscoveryCommand::ReintroduceTo { prefix };
+    participant.dpi.lock().unwrap().discovery_command_sender.send(command).unwrap();
+    std::thread::sleep(Duration::from_millis(20));
+    for participant_id in 0..5 {
+      let port = spdp_well_known_unicast_port(domain, participant_id);
+      returning.send_to(&datagram, ("127.0.0.1", port)).unwrap();
+    }
+    let arrived = arrivals(&returning, own, Instant::now() + Duration::from_millis(500));
+    assert!(!arrived.is_empty(), "no announcement");
+    assert!(!arrived.iter().any(|(_, is_goodbye)| *is_goodbye), "{arrived:?}");
   }
 
   // The event loop is slow: discovery has read both announcements before it handles the first.
