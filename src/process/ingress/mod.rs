@@ -261,8 +261,10 @@ impl Ingress {
         if turned {
             self.role.report_turn(LaneMode::Normal as u8, 0, self.participant.network_refusals());
         }
-        self.search_at = searching.then(|| now.plus_ms(SEARCHING_MS));
-        let interval_ms = if self.hold_until.is_some() { HOLD_POLL_MS } else { HOUSEKEEPING_MS };
+        let holds = self.hold_until.is_some();
+        // What is held back must not wait for the next search.
+        self.search_at = (searching && !holds).then(|| now.plus_ms(SEARCHING_MS));
+        let interval_ms = if holds { HOLD_POLL_MS } else { HOUSEKEEPING_MS };
         self.housekeeping_at = now.plus_ms(interval_ms);
         outcome
     }
