@@ -45,7 +45,8 @@ impl Place {
     }
 
     /// Like [`take`](Self::take), but with a `standby` a process that finds the role taken waits until the
-    /// other process ends. `None` if `stop` was requested meanwhile.
+    /// other process ends, and calls `prepare` at first and about every 50 ms meanwhile. `None` if `stop` was
+    /// requested.
     ///
     /// # Errors
     /// Without a standby another process serves the role, with one another process waits for it; or shared
@@ -57,6 +58,7 @@ impl Place {
         scheduling: &Scheduling,
         standby: config::Standby,
         stop: &Stop,
+        prepare: &mut dyn FnMut(&ShmNode, &Settings),
     ) -> Result<Option<Self>, RoleError> {
         let (_, name) = role;
         let mut reloads = WaitingReloads::start(requests, settings)?;
@@ -73,7 +75,9 @@ impl Place {
             return Ok(Some(Self { lock, node, boards, reloads, take_over: None }));
         }
         let Some(mut waiting) = Waiting::open(settings, role, &boards, stop)? else { return Ok(None) };
-        let Some(lock) = waiting.wait(settings, name, stop)? else { return Ok(None) };
+        let in_force = &reloads.in_force.settings;
+        let mut prepare = || prepare(&node, in_force);
+        let Some(lock) = waiting.wait(settings, name, stop, &mut prepare)? else { return Ok(None) };
         reloads.refresh();
         Ok(Some(Self { lock, node, boards, reloads, take_over: Some(waiting.take_over()) }))
     }

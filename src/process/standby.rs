@@ -211,12 +211,14 @@ impl Waiting {
     }
 
     /// Waits until the role is free, and takes it; `None` if `stop` was requested meanwhile. If the active
-    /// process has handed over just before, it takes the role all the same, to say goodbye.
+    /// process has handed over just before, it takes the role all the same, to say goodbye. Calls `prepare`
+    /// at first, and about every 50 ms.
     pub fn wait(
         &mut self,
         settings: &Settings,
         name: &str,
         stop: &Stop,
+        prepare: &mut dyn FnMut(),
     ) -> Result<Option<RoleLock>, RoleError> {
         let mut notifier = Notifier::new();
         notifier.ready();
@@ -230,6 +232,7 @@ impl Waiting {
                 self.board.update(|board| board.alive_at = now);
                 notifier.feed_watchdog(now);
                 notifier.status(now, |line| *line += "standby");
+                prepare();
             }
             let was_connected = self.active.is_some();
             self.receive()?;

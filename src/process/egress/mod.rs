@@ -92,7 +92,10 @@ pub fn egress(
     let Lane { scheduling, standby, .. } = &settings.lanes[index];
     let role_name = format!("egress-{name}");
     let role = (ProcessRole::Egress(index), &*role_name);
-    let Some(place) = Place::wait(settings, reloads, role, scheduling, *standby, stop)? else {
+    // A queue before the take-over would hold samples for nobody.
+    let mut prepare = |_: &_, _: &_| ();
+    let waited = Place::wait(settings, reloads, role, scheduling, *standby, stop, &mut prepare)?;
+    let Some(place) = waited else {
         return Ok(());
     };
     let settings = &place.settings().clone();

@@ -23,8 +23,8 @@ use crate::model::{
     Reliability, RouteInfo, SampleHeader, TopicName, TrafficClass,
 };
 use crate::shm::{
-    BacklogKeeper, BoardWriter, Boards, HistogramWriter, LaneWaker, LoanError, NoMemory, PoolBudget,
-    RouteChannel, SamplePublisher, ShmError, ShmNode, Stage, backlog_bytes,
+    BacklogKeeper, BoardWriter, Boards, HistogramWriter, LaneWaker, LoanError, NoMemory, RouteChannel,
+    SamplePublisher, ShmError, ShmNode, Stage, backlog_bytes,
 };
 
 /// Interval at which a route without a publisher logs that it waits.
@@ -84,7 +84,7 @@ struct ActiveReader {
 }
 
 impl Input {
-    /// Opens the pool of the route with this number.
+    /// Opens what ingress keeps of the pool of the route with this number.
     ///
     /// # Errors
     /// Shared memory cannot be opened.
@@ -93,10 +93,9 @@ impl Input {
         boards: &Boards,
         settings: &Settings,
         index: usize,
-        budget: &Arc<PoolBudget>,
+        publisher: SamplePublisher,
     ) -> Result<OpenedPool, ShmError> {
         let channel = RouteChannel::of(settings, index);
-        let publisher = SamplePublisher::create_within(node, &channel, budget, index)?;
         let board = boards.backlog_writer(index);
         let backlog = BacklogKeeper::open(node, &channel, &publisher, backlog_bytes(settings), board)?;
         Ok((publisher, backlog))

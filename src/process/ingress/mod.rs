@@ -10,6 +10,7 @@ mod input;
 pub(super) mod memory;
 mod patterns;
 mod pool;
+mod prepared;
 mod publishers;
 mod reader_record;
 mod receiving;
@@ -34,10 +35,11 @@ use crate::clock;
 use crate::config::{InputTopic, Route, Settings};
 use crate::dds::{ArrivalFlag, Discovery, DiscoveryTurn, Participant};
 use crate::model::{LaneMode, MonotonicNs, TrafficClass};
-use crate::shm::{Boards, PoolBudget, ProcessRole, ShmError, ShmNode};
+use crate::shm::{Boards, ProcessRole, ShmError, ShmNode};
 use early_waker::EarlyWaker;
 use input::{Input, OpenedPool};
 use patterns::Patterns;
+use prepared::PreparedPools;
 use receiving::{Receiving, ServedLane};
 
 /// The name of the role, and of the node.
@@ -74,11 +76,12 @@ const HOLD_POLL_MS: u64 = 1;
 pub fn ingress(settings: &Settings, reloads: ReloadRequests, stop: &Stop) -> Result<(), RoleError> {
     let role = (ProcessRole::Ingress, NAME);
     let (scheduling, standby) = (&settings.ingress_scheduling, settings.ingress_standby);
-    let Some(place) = Place::wait(settings, reloads, role, scheduling, standby, stop)? else {
-        return Ok(());
-    };
+    let mut pools = PreparedPools::None;
+    let mut prepare = |node: &ShmNode, settings: &Settings| pools.follow(node, settings);
+    let waited = Place::wait(settings, reloads, role, scheduling, standby, stop, &mut prepare)?;
+    let Some(place) = waited else { return Ok(()) };
     let settings = &place.settings().clone();
-    let mut ingress = Ingress::open(settings, place)?;
+    let mut ingress = Ingress::open(settings, place, pools)?;
     info!(routes = settings.routes.len(), domain_id = settings.input.domain_id, "ingress is up");
     let leave = loop {
         if stop.is_requested() {
@@ -138,7 +141,7 @@ impl Drop for Ingress {
 }
 
 impl Ingress {
-    fn open(settings: &Settings, place: Place) -> Result<Self, RoleError> {
+    fn open(settings: &Settings, place: Place, pools: PreparedPools) -> Result<Self, RoleError> {
         let role = Role::open(place, ProcessRole::Ingress);
         memory_limit::check(settings, ProcessRole::Ingress);
         let urgent: Vec<_> = urgent_routes(settings).collect();
@@ -157,7 +160,7 @@ impl Ingress {
         };
         let standby = settings.ingress_standby;
         let (role, pools, (participant, identity, continued)) = role.open_beside(
-            |node, boards| open_pools(node, boards, settings),
+            |node, boards| open_pools(node, boards, settings, pools),
             |role| Identity::join(role, ProcessRole::Ingress, NAME, &options, standby, open),
         )?;
         let mut inputs = Vec::with_capacity(settings.routes.len());
@@ -301,11 +304,15 @@ impl Ingress {
     }
 }
 
-/// Opens the pool of each route.
-fn open_pools(node: &ShmNode, boards: &Boards, settings: &Settings) -> Result<Vec<OpenedPool>, ShmError> {
-    let budget = PoolBudget::of(settings);
-    let routes = 0..settings.routes.len();
-    routes.map(|route| Input::open_pool(node, boards, settings, route, &budget)).collect()
+/// Opens the pool of each route, with what a standby has prepared.
+fn open_pools(
+    node: &ShmNode,
+    boards: &Boards,
+    settings: &Settings,
+    prepared: PreparedPools,
+) -> Result<Vec<OpenedPool>, ShmError> {
+    let pools = prepared.finish(node, settings)?.into_iter().enumerate();
+    pools.map(|(route, pool)| Input::open_pool(node, boards, settings, route, pool)).collect()
 }
 
 /// The lanes, critical ones first.

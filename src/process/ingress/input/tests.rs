@@ -8,6 +8,7 @@ use super::*;
 use crate::dds::{Payload, RawWriter};
 use crate::model::{Encapsulation, MAX_PUBLISHERS, QosProfile, SampleKey, SourceTimestamp, TypeHash};
 use crate::policy::Location;
+use crate::process::ingress::prepared::PreparedPools;
 use crate::process::role::participant_options;
 use crate::process::test_role::{self, SCAN, TYPE, wait_until};
 use crate::shm::ProcessRole;
@@ -34,8 +35,9 @@ impl Host {
     }
 
     fn open(&self) -> Input {
-        let budget = PoolBudget::of(&self.settings);
-        let pool = Input::open_pool(&self.role.node, &self.role.boards, &self.settings, 0, &budget).unwrap();
+        let (node, boards) = (&self.role.node, &self.role.boards);
+        let publisher = PreparedPools::None.finish(node, &self.settings).unwrap().remove(0);
+        let pool = Input::open_pool(node, boards, &self.settings, 0, publisher).unwrap();
         Input::open(&self.role, &self.settings, 0, &ArrivalFlag::passive(), pool)
     }
 
