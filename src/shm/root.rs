@@ -3,7 +3,7 @@
 use std::ffi::OsString;
 use std::fs::{self, DirBuilder};
 use std::io::{self, ErrorKind};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
+use std::os::unix::fs::{DirBuilderExt, DirEntryExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use nix::unistd::{AccessFlags, access, geteuid};
@@ -125,10 +125,16 @@ impl InstanceDir {
 
     /// This instance's files in [`SHM_DIR`].
     pub(super) fn shm_files(&self) -> Vec<PathBuf> {
+        self.shm_inodes().into_iter().map(|(_, path)| path).collect()
+    }
+
+    /// This instance's files in [`SHM_DIR`], with their inode numbers, which no later file has.
+    pub(super) fn shm_inodes(&self) -> Vec<(u64, PathBuf)> {
         let Ok(entries) = fs::read_dir(SHM_DIR) else { return Vec::new() };
         let ours = |name: &OsString| name.as_encoded_bytes().starts_with(self.prefix.as_bytes());
-        let names = entries.flatten().map(|entry| entry.file_name()).filter(ours);
-        names.map(|name| Path::new(SHM_DIR).join(name)).collect()
+        let entries = entries.flatten().map(|entry| (entry.ino(), entry.file_name()));
+        let ours = entries.filter(|(_, name)| ours(name));
+        ours.map(|(inode, name)| (inode, Path::new(SHM_DIR).join(name))).collect()
     }
 }
 

@@ -1,10 +1,11 @@
 //! A segment of shared memory, made of 64-bit words, which outlives the processes that map it.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
 use std::io::ErrorKind;
 use std::num::NonZeroUsize;
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU32, AtomicU64};
 
@@ -151,17 +152,31 @@ fn commit(file: &File, bytes: u64, what: &str) -> Result<(), ShmError> {
 /// How the name of a pool ends, of which ingress allocates what it uses.
 const POOL_SUFFIX: &str = "data";
 
-/// Allocates all pages of files in shared memory, but not those of pools. iceoryx2 only sets the length of
-/// its segments; if the file system is full when a page is first touched, SIGBUS kills the process while it
-/// handles a sample.
-pub(super) fn commit_files(files: &[std::path::PathBuf], what: &str) -> Result<(), ShmError> {
-    for path in files.iter().filter(|path| path.extension().is_none_or(|suffix| suffix != POOL_SUFFIX)) {
-        // A file that is missing or not readable yet belongs to a process that is starting or ending.
-        let Ok(file) = OpenOptions::new().read(true).write(true).open(path) else { continue };
-        let Ok(metadata) = file.metadata() else { continue };
-        if metadata.len() > 0 && metadata.blocks() * 512 < metadata.len() {
-            commit(&file, metadata.len(), what)?;
+/// Allocates all pages of files in shared memory, but not those of pools, nor of files that are `committed`.
+/// iceoryx2 only sets the length of its segments; if the file system is full when a page is first touched,
+/// SIGBUS kills the process while it handles a sample.
+pub(super) fn commit_files(
+    files: &[(u64, PathBuf)],
+    committed: &mut BTreeSet<u64>,
+    what: &str,
+) -> Result<(), ShmError> {
+    let before = std::mem::take(committed);
+    for (inode, path) in files {
+        if path.extension().is_some_and(|suffix| suffix == POOL_SUFFIX) {
+            continue;
         }
+        if !before.contains(inode) {
+            // A file that is missing or not readable yet belongs to a process that is starting or ending.
+            let Ok(file) = OpenOptions::new().read(true).write(true).open(path) else { continue };
+            let Ok(metadata) = file.metadata() else { continue };
+            if metadata.len() == 0 {
+                continue;
+            }
+            if metadata.blocks() * 512 < metadata.len() {
+                commit(&file, metadata.len(), what)?;
+            }
+        }
+        committed.insert(*inode);
     }
     Ok(())
 }
