@@ -32,7 +32,7 @@ pub(super) const LOANED_SLOTS: usize = 1 + LENT_SLOTS;
 pub(super) const TAP: QueueLimits = QueueLimits { queue_depth: 4, max_borrowed: 2 };
 /// Samples that wait in the queue of ingress itself, which takes each one after it has published it.
 const BACKLOG_QUEUE: usize = 4;
-/// The most publishers of a route: ingress, and one for a future standby.
+/// The most publishers of a route: ingress and its standby.
 const PUBLISHERS: usize = 2;
 /// Attempts to open a service whose creator has died or whose last user is removing it, and the pause between
 /// them.

@@ -92,7 +92,7 @@ pub fn egress(
     let Lane { scheduling, standby, .. } = &settings.lanes[index];
     let role_name = format!("egress-{name}");
     let role = (ProcessRole::Egress(index), &*role_name);
-    // A queue before the take-over would hold samples for nobody.
+    // A standby opens no queue: ingress would deliver samples to it.
     let mut prepare = |_: &_, _: &_| ();
     let waited = Place::wait(settings, reloads, role, scheduling, *standby, stop, &mut prepare)?;
     let Some(place) = waited else {

@@ -38,13 +38,12 @@ impl PreparedPools {
     /// The pools of all routes for these settings: those that are created already, if they are for the same
     /// channels.
     pub fn finish(self, node: &ShmNode, settings: &Settings) -> Result<Vec<SamplePublisher>, ShmError> {
+        let channels: Vec<_> = channels(settings).collect();
         match self {
-            Self::Created(pools)
-                if channels(settings).eq(pools.iter().map(|(channel, _)| channel.clone())) =>
-            {
+            Self::Created(pools) if pools.iter().map(|(channel, _)| channel).eq(&channels) => {
                 Ok(pools.into_iter().map(|(_, pool)| pool).collect())
             }
-            // What was created for other channels must not keep them.
+            // iceoryx2 refuses another channel of a route while pools of the first one exist.
             other => {
                 drop(other);
                 create(node, settings)

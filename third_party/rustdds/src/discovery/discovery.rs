@@ -1405,8 +1405,8 @@ impl Discovery {
 
     if was_new {
       self.silent.retain(|(silent, _)| *silent != guid_prefix);
-      // It has come back by itself. After a goodbye it would forget the Writers that it is matched with
-      // by then, and receive again what it has not acknowledged.
+      // A goodbye is due if it was silent. It would then forget the Writers that it has matched by then, and
+      // receive again what it has not acknowledged.
       self.departing.retain(|departing| *departing != guid_prefix);
       // Inform DDS Applications
       self.send_participant_status(DomainParticipantStatusEvent::ParticipantDiscovered {
