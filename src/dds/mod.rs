@@ -26,7 +26,7 @@ pub use graph_watch::{GraphRefusals, GraphWatch, MAX_GRAPH_ENDPOINTS, MAX_PARTIC
 pub use identity::{FormerSample, Kept, ParticipantIdentity, WriterContinuation};
 pub use memory::{DISCOVERY_BYTES, SOCKETS_BYTES, WITHHELD_BYTES, history_bytes};
 pub use network::{host_addresses, interfaces};
-pub use participant::{Participant, ParticipantOptions};
+pub use participant::{EVENT_LOOP_THREAD, Participant, ParticipantOptions};
 pub use qos::ReaderQos;
 pub use reader::{
     ArrivalFlag, AssemblyLimits, Inbox, LentMemory, PartialArrival, Payload, RawReader, ReaderEvent,

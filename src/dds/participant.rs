@@ -29,6 +29,10 @@ use crate::model::{
     QosProfile, Reliability, SourceTimestamp,
 };
 
+/// The part that the kernel keeps of the name of the thread of a participant that receives, acknowledges and
+/// repairs.
+pub const EVENT_LOOP_THREAD: &str = "RustDDS Partici";
+
 /// The settings of a participant.
 #[derive(Clone, Debug)]
 pub struct ParticipantOptions<'a> {

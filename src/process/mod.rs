@@ -6,6 +6,7 @@
 //! needed for each sample: discovery, matching, logs, health.
 
 mod allocator;
+mod blocked;
 mod control;
 mod count_log;
 mod egress;

@@ -18,7 +18,7 @@ use super::lock::FileLock;
 use super::root::{InstanceDir, SHM_DIR};
 use super::segment::Segment;
 use super::send_log::SendLog;
-use super::wake::{LaneSleeper, LaneWaker};
+use super::wake::{LaneObserver, LaneSleeper, LaneWaker};
 use crate::config::Settings;
 use crate::model::{
     AbsenceRecord, Backlog, ControlRecord, EndpointIdentity, IngressCounters, InstanceName, IntruderRecord,
@@ -369,6 +369,11 @@ impl Boards {
     /// The sleeper of a lane, for its egress process. One at a time.
     pub fn sleeper(&self, lane: usize) -> LaneSleeper {
         LaneSleeper::new(self.segment.clone(), self.layout.wake(lane))
+    }
+
+    /// The observer of a lane, for its standby.
+    pub fn observer(&self, lane: usize) -> LaneObserver {
+        LaneObserver::new(self.segment.clone(), self.layout.wake(lane))
     }
 
     fn writer<T: Plain>(&self, cell: Cell<T>) -> BoardWriter<T> {

@@ -55,4 +55,4 @@ pub use roles::{RoleHolder, RoleLock, instance_files};
 pub use root::{default_root, root_of};
 pub use send_log::SendLog;
 pub use subscriber::{SampleSubscriber, ShmSample, SubscriberRole, TakeError};
-pub use wake::{LaneSleeper, LaneWaker, Woken, this_cpu};
+pub use wake::{LaneObserver, LaneSleeper, LaneWaker, Woken, this_cpu};

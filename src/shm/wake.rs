@@ -196,6 +196,33 @@ impl LaneSleeper {
     }
 }
 
+/// Shows to another process whether a lane has work.
+#[derive(Clone, Debug)]
+pub struct LaneObserver {
+    words: LaneWaker,
+    /// The wake count when the lane had last run.
+    seen_count: u32,
+}
+
+impl LaneObserver {
+    pub(super) fn new(segment: Arc<Segment>, at: usize) -> Self {
+        let words = LaneWaker::new(segment, at);
+        let seen_count = words.wake_count().load(Ordering::Relaxed);
+        Self { words, seen_count }
+    }
+
+    /// Notes that the lane has run: it has seen the wakes so far.
+    pub fn note_ran(&mut self) {
+        self.seen_count = self.words.wake_count().load(Ordering::Relaxed);
+    }
+
+    /// Whether there was a wake since the lane has run, or it is not in [`LaneSleeper::sleep`].
+    pub fn has_work(&self) -> bool {
+        let is_awake = self.words.sleeping_cpu().load(Ordering::Relaxed) == 0;
+        is_awake || self.words.wake_count().load(Ordering::Relaxed) != self.seen_count
+    }
+}
+
 /// One more than the number of the CPU that this thread runs on.
 pub fn this_cpu() -> u32 {
     let cpu = sched_getcpu().ok().and_then(|cpu| u32::try_from(cpu).ok());

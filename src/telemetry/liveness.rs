@@ -3,6 +3,7 @@
 use std::fs::{self, File};
 use std::io;
 use std::os::unix::fs::FileExt;
+use std::path::Path;
 
 use serde::Serialize;
 
@@ -92,15 +93,25 @@ impl StatFile {
     /// # Errors
     /// No process has that id.
     pub fn open(pid: i32) -> io::Result<Self> {
-        File::open(format!("/proc/{pid}/stat")).map(Self)
+        Self::of(&Path::new("/proc").join(pid.to_string()))
+    }
+
+    /// Opens the file in the folder of a process or thread.
+    pub(super) fn of(folder: &Path) -> io::Result<Self> {
+        File::open(folder.join("stat")).map(Self)
     }
 
     /// Whether SIGSTOP has stopped the process. A debugger stops it in another way.
     pub fn is_stopped(&self) -> bool {
+        self.state() == Some('T')
+    }
+
+    /// The state letter; `None` when the process has ended.
+    pub(super) fn state(&self) -> Option<char> {
         // The name has 64 bytes at most.
         let mut bytes = [0; 128];
         let length = self.0.read_at(&mut bytes, 0).unwrap_or(0);
-        state_letter(&bytes[..length]) == Some('T')
+        state_letter(&bytes[..length])
     }
 }
 

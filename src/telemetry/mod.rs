@@ -31,7 +31,7 @@ pub use snapshot::{
     LaneReading, OutputReading, PatternReading, ProcessReading, RouteReading, Snapshot, SubscriberReading,
 };
 pub use text::{bytes_text, shortened, wrapped};
-pub use threads::Starvation;
+pub use threads::{Starvation, ThreadFiles, may_go_on};
 
 impl Snapshot {
     /// The report of this snapshot, with rates and latencies since `earlier`. A bridge that was restarted in

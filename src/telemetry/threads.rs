@@ -1,6 +1,15 @@
-//! Whether other programs keep the threads of a process from running.
+//! Whether the threads of a process run, and whether other programs keep them from it.
 
+use std::fs::{self, File};
+use std::io;
+use std::os::unix::fs::FileExt;
+
+use super::liveness::StatFile;
 use crate::model::MonotonicNs;
+
+/// States of a thread (proc(5)) that runs or is ready to run, or that waits for a disk, as it does for a page
+/// of memory.
+const READY: [char; 2] = ['R', 'D'];
 
 /// A thread of a process at an instant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -17,18 +26,73 @@ impl Thread {
     fn parse(id: u64, schedstat: &str, stat: &str) -> Option<Self> {
         let cpu_ns = schedstat.split_whitespace().next()?.parse().ok()?;
         let (_, fields) = stat.rsplit_once(')')?;
-        Some(Self { id, cpu_ns, ready: fields.trim_start().starts_with(['R', 'D']) })
+        Some(Self { id, cpu_ns, ready: fields.trim_start().starts_with(READY) })
     }
 
     /// Reads the threads of a process from `/proc`; none if the process does not exist or is not readable.
     fn all(pid: u64) -> Vec<Self> {
-        let folders = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
-        let read = |folder: std::fs::DirEntry| {
+        let read = |folder: fs::DirEntry| {
             let id = folder.file_name().to_str()?.parse().ok()?;
-            let file = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap_or_default();
+            let file = |name: &str| fs::read_to_string(folder.path().join(name)).unwrap_or_default();
             Self::parse(id, &file("schedstat"), &file("stat"))
         };
-        folders.filter_map(read).collect()
+        folders(pid).filter_map(read).collect()
+    }
+}
+
+/// The folders of the threads of a process.
+fn folders(pid: u64) -> impl Iterator<Item = fs::DirEntry> {
+    fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten()
+}
+
+/// Whether a thread of the process runs, is ready to run or waits for a disk, or the process ends.
+pub fn may_go_on(pid: u64) -> bool {
+    // The files of other threads that have ended are gone at once.
+    const ENDED: char = 'Z';
+    let state = |folder: fs::DirEntry| StatFile::of(&folder.path()).ok()?.state();
+    folders(pid).filter_map(state).any(|state| state == ENDED || READY.contains(&state))
+}
+
+/// The open files of a thread, for checks many times a second.
+#[derive(Debug)]
+pub struct ThreadFiles {
+    stat: StatFile,
+    schedstat: File,
+    cpu_ns: u64,
+}
+
+impl ThreadFiles {
+    /// Opens the files of the thread with that id.
+    ///
+    /// # Errors
+    /// There is no such thread, or the kernel keeps no CPU times.
+    pub fn open(id: i32) -> io::Result<Self> {
+        let schedstat = File::open(format!("/proc/{id}/schedstat"))?;
+        Ok(Self { stat: StatFile::open(id)?, schedstat, cpu_ns: 0 })
+    }
+
+    /// Opens the files of the first thread of a process with that name, of which the kernel keeps 15 bytes.
+    ///
+    /// # Errors
+    /// As for [`open`](Self::open).
+    pub fn open_named(pid: u64, name: &str) -> io::Result<Self> {
+        let has_name = |folder: &fs::DirEntry| {
+            fs::read_to_string(folder.path().join("comm")).is_ok_and(|comm| comm.trim_end() == name)
+        };
+        let folder = folders(pid).find(has_name).ok_or(io::ErrorKind::NotFound)?;
+        let id = folder.file_name().to_str().and_then(|id| id.parse().ok());
+        Self::open(id.ok_or(io::ErrorKind::InvalidData)?)
+    }
+
+    /// Whether the thread has run since the last call, is ready to run or waits for a disk.
+    pub fn has_run(&mut self) -> bool {
+        let mut bytes = [0; 64];
+        let length = self.schedstat.read_at(&mut bytes, 0).unwrap_or(0);
+        let cpu_ns = bytes[..length].iter().map_while(|digit| char::from(*digit).to_digit(10));
+        let cpu_ns = cpu_ns.fold(0_u64, |sum, digit| sum.wrapping_mul(10).wrapping_add(digit.into()));
+        // A thread that has ended never runs again, and is not ready.
+        std::mem::replace(&mut self.cpu_ns, cpu_ns) != cpu_ns
+            || self.stat.state().is_some_and(|state| READY.contains(&state))
     }
 }
 
@@ -70,7 +134,46 @@ impl Starvation {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::mpsc::channel;
+
     use super::*;
+
+    #[test]
+    fn a_thread_that_waits_has_not_run_and_one_that_worked_has() {
+        let pid = std::process::id().into();
+        let name = "thread-to-watch";
+        assert!(ThreadFiles::open_named(pid, name).is_err());
+        let (work, works) = channel();
+        let (done, is_done) = channel();
+        let worker = std::thread::Builder::new().name(name.into()).spawn(move || {
+            for () in works {
+                let sum: u64 = std::hint::black_box(0..10_000).sum();
+                done.send(sum).unwrap();
+            }
+        });
+        let worker = worker.unwrap();
+        let round = || {
+            work.send(()).unwrap();
+            is_done.recv().unwrap();
+        };
+        round();
+        let mut files = ThreadFiles::open_named(pid, name).unwrap();
+        for _ in 0..3 {
+            round();
+            assert!(files.has_run());
+            // It may still be on its way to the next wait.
+            let asleep = (0..1_000).any(|_| {
+                std::thread::sleep(std::time::Duration::from_millis(10));
+                !files.has_run()
+            });
+            assert!(asleep);
+            assert!(!files.has_run());
+        }
+        assert!(may_go_on(pid), "this thread runs");
+        drop(work);
+        worker.join().unwrap();
+        assert!(!may_go_on(u64::MAX));
+    }
 
     #[test]
     fn a_process_starves_if_a_thread_is_ready_and_gets_less_than_half_a_cpu() {

@@ -17,6 +17,11 @@ const WATCHED: &str = "Cyclone DDS, RELIABLE";
 
 const LANE: &str = "egress-critical";
 
+/// What a standby logs before it kills the active process because it hangs.
+const KILLS_HUNG: &str = "standby: kills the active process: ";
+/// How the line goes on if a thread of the process has work and does not run, without the wait for its turns.
+const HAS_WORK: &str = "sleeps although";
+
 /// How often the test repeats its eight take-overs; 1 without it.
 const ROUNDS_VARIABLE: &str = "ADAPTIVE_BRIDGE_TEST_TAKE_OVER_ROUNDS";
 
@@ -99,8 +104,9 @@ fn a_standby_takes_over_and_no_subscriber_misses_a_sample() {
 fn a_standby_takes_over_from_a_process_that_hangs() {
     let test = "a_standby_takes_over_from_a_process_that_hangs";
     let event_loop = threads::THREADS[1];
-    let events = [(LANE, Event::Hang(None)), ("ingress", Event::Hang(event_loop))];
-    // For half a second ingress acknowledges nothing, for which a KEEP_ALL publisher waits.
+    let events =
+        [(LANE, Event::Hang(None)), ("ingress", Event::Hang(event_loop)), (LANE, Event::Hang(event_loop))];
+    // On a busy machine ingress acknowledges nothing for half a second, for which a KEEP_ALL publisher waits.
     take_over(test, &events, Peer::cyclone().keep_last(1_000));
 }
 
@@ -154,6 +160,11 @@ fn take_over(test: &str, events: &[(&str, Event)], publisher: Peer) {
         assert!(!std::path::Path::new(&format!("/proc/{pid}")).exists(), "a stopped process lives: {pid}");
     }
     all_receive(2_400);
+    let log = bed.up.log();
+    let at_once = log.lines().filter(|line| line.contains(KILLS_HUNG) && line.contains(HAS_WORK)).count();
+    let hangs = events.iter().filter(|(_, event)| event.cause() == "hung").count();
+    println!("{at_once} of {hangs} hangs noticed by a thread that has work");
+    assert_eq!(at_once > 0, hangs > 0, "{log}");
     let sent: Sent = publisher.end();
     sent.assert_not_blocked();
     bed.wait_accounted();
@@ -317,6 +328,13 @@ mod long {
             }
             end(name, subscriber, sent).assert_all_of(sent);
         }
+        let log = bed.up.log();
+        let hung: Vec<_> = log.lines().filter(|line| line.contains(KILLS_HUNG)).collect();
+        assert!(
+            hung.is_empty(),
+            "nothing hung, and a standby killed the active process:\n{}",
+            hung.join("\n")
+        );
         bed.end();
     }
 

@@ -3,6 +3,7 @@
 //! The types of the data plane allocate only on construction and when their configuration changes.
 
 mod absences;
+mod blocked;
 mod catch_up;
 mod classifier;
 mod clock_offset;
@@ -28,6 +29,7 @@ mod warnings;
 pub use absences::{
     Absence, AbsenceEvent, AbsenceWatch, HostInterface, MAX_WATCHED_PEERS, REMEMBER_ABSENCE_MS,
 };
+pub use blocked::BlockedWatch;
 pub use catch_up::CatchUp;
 pub use classifier::{
     FORGET_UNLISTED_MS, MIN_SETTLED, SubscriberClassifier, Transition, TransitionReason, is_forgotten,
@@ -57,6 +59,6 @@ pub use safety::{
 };
 pub use sequence::{SequenceOutcome, SequenceTracker};
 pub use staleness::{age_ns, is_stale};
-pub use take_overs::{hang_limit_ms, is_take_over_storm, may_fence, take_overs_in_a_row};
+pub use take_overs::{blocked_limit_ms, hang_limit_ms, is_take_over_storm, may_fence, take_overs_in_a_row};
 pub use token_bucket::{BURST_WINDOW_NS, ByteBudget, MAX_RATE_HZ, TokenBucket, burst_for};
 pub use warnings::{SubscriberWarnings, WarningThresholds};

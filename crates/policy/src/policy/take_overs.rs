@@ -14,6 +14,12 @@ const HANG_MS_PER_ROUTE: u64 = 10;
 /// The most, after several take-overs in a row: the limit of the watchdogs of systemd and `up`.
 const MAX_HANG_MS: u64 = 2_000;
 
+/// How long a thread of an active process may have work and not run. The kernel runs one that is woken within
+/// microseconds, or it is ready to run, which does not count.
+const BLOCKED_MS: u64 = 12;
+/// Several take-overs in a row double it so many times at most, to 384 ms.
+const MAX_BLOCKED_DOUBLINGS: u64 = 5;
+
 /// The longest time between two take-overs in a row.
 const IN_A_ROW_MS: u64 = 60_000;
 
@@ -33,6 +39,13 @@ pub fn hang_limit_ms(record: &StandbyRecord, routes: usize, now: MonotonicNs) ->
     let doublings = if is_recent(record, now) { record.in_a_row.min(2) } else { 0 };
     let once_ms = (routes as u64).saturating_mul(HANG_MS_PER_ROUTE).saturating_add(HANG_MS);
     (once_ms.min(MAX_HANG_MS) << doublings).min(MAX_HANG_MS)
+}
+
+/// How long a thread of the active process of a role may have work and not run, `now`, before the standby
+/// kills the process, in milliseconds. Each take-over in a row doubles it.
+pub fn blocked_limit_ms(record: &StandbyRecord, now: MonotonicNs) -> u64 {
+    let doublings = if is_recent(record, now) { record.in_a_row.min(MAX_BLOCKED_DOUBLINGS) } else { 0 };
+    BLOCKED_MS << doublings
 }
 
 /// How many take-overs have followed each other within a minute, with one that happens `now` for `cause`
@@ -82,6 +95,19 @@ mod tests {
             [1, 60, 1_024, usize::MAX].map(|routes| limit_ms(0, routes, 60_001)),
             [510, 1_100, 2_000, 2_000]
         );
+    }
+
+    #[test]
+    fn the_time_in_which_a_thread_with_work_may_sleep_doubles_with_take_overs() {
+        let limit_ms = |in_a_row, ms| {
+            let record = StandbyRecord { taken_over_at: at(1), in_a_row, ..StandbyRecord::default() };
+            blocked_limit_ms(&record, at(ms))
+        };
+        assert_eq!(
+            [0, 1, 2, 5, 6, u64::MAX].map(|in_a_row| limit_ms(in_a_row, 60_001)),
+            [12, 24, 48, 384, 384, 384]
+        );
+        assert_eq!(limit_ms(3, 60_002), 12, "a minute has passed");
     }
 
     #[test]
