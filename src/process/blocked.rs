@@ -1,5 +1,5 @@
-//! Finds a thread of the active process that sleeps although it has work, within 12 to 24 ms. The turns of the
-//! process show it only after 500 ms.
+//! Finds a thread of the active process that sleeps although it has work, within 12 to 24 ms. The turns of
+//! the process show it only after 500 ms.
 
 use std::fmt;
 use std::io;
