@@ -6,7 +6,7 @@ use super::error::RoleError;
 use super::kept_sockets;
 use super::reload::{ReloadRequests, WaitingReloads};
 use super::scheduling;
-use super::standby::{TakeOver, Waiting};
+use super::standby::{TakeOver, Waiting, take_place};
 use super::stop::Stop;
 use crate::clock;
 use crate::config::{self, Scheduling, Settings};
@@ -66,6 +66,15 @@ impl Place {
             Err(ShmError::AlreadyServed { .. }) if standby == config::Standby::Warm => None,
             lock => Some(lock?),
         };
+        let mut place = None;
+        if lock.is_none() {
+            // Before the rest: a process that takes the role over needs the CPU time which this one takes to
+            // attach, and to clean up after the one that died.
+            place = take_place(settings, name, stop)?;
+            if place.is_none() {
+                return Ok(None);
+            }
+        }
         let (node, boards) = attach(settings, name, scheduling)?;
         // If both processes of the role have died, the one whose supervisor has the sockets goes first.
         let gives_way = standby == config::Standby::Warm
@@ -74,7 +83,12 @@ impl Place {
         if let Some(lock) = lock.filter(|_| !gives_way) {
             return Ok(Some(Self { lock, node, boards, reloads, take_over: None }));
         }
-        let Some(mut waiting) = Waiting::open(settings, role, &boards, stop)? else { return Ok(None) };
+        let place = match place {
+            None => take_place(settings, name, stop)?,
+            place => place,
+        };
+        let Some(place) = place else { return Ok(None) };
+        let mut waiting = Waiting::open(settings, place, role, &boards)?;
         let in_force = &reloads.in_force.settings;
         let mut prepare = || prepare(&node, in_force);
         let Some(lock) = waiting.wait(settings, name, stop, &mut prepare)? else { return Ok(None) };
@@ -110,4 +124,57 @@ fn attach(settings: &Settings, name: &str, scheduling: &Scheduling) -> Result<(S
     }
     let boards = node.boards(&BridgeShape::of(settings))?;
     Ok((node, boards))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::path::Path;
+    use std::time::Duration;
+
+    use super::super::test_role::{SCAN, wait_until};
+    use super::*;
+
+    /// How many files and folders are below a folder.
+    fn entries(folder: &Path) -> usize {
+        let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+        entries.map(|entry| 1 + entries_of(&entry)).sum()
+    }
+
+    fn entries_of(entry: &fs::DirEntry) -> usize {
+        if entry.file_type().is_ok_and(|kind| kind.is_dir()) { entries(&entry.path()) } else { 0 }
+    }
+
+    #[test]
+    fn a_process_attaches_to_shared_memory_when_the_take_over_of_its_role_is_complete() {
+        const ROLE: &str = "ingress";
+        let folder = tempfile::tempdir().unwrap();
+        let instance = format!("place_{}", std::process::id());
+        let root = folder.path().display();
+        let text = format!("instance: {instance}\nshared_memory: {{root_path: {root}}}\n{SCAN}\n");
+        let settings = config::parse(&text, "f.yaml", &|_| None).unwrap();
+        let acquired = |acquire: fn(&Path, &_, &str) -> Result<RoleLock, ShmError>| {
+            acquire(&root_of(&settings), &settings.instance, ROLE).unwrap()
+        };
+        let (_active, taking_over) = (acquired(RoleLock::acquire), acquired(RoleLock::acquire_standby));
+        let before = entries(folder.path());
+        let stop = Stop::default();
+        std::thread::scope(|scope| {
+            let next = scope.spawn(|| {
+                let read = settings.clone();
+                let reloads = ReloadRequests::on_signal(move |_| Ok(read.clone().into())).unwrap();
+                let role = (ProcessRole::Ingress, ROLE);
+                let (scheduling, warm) = (Scheduling::default(), config::Standby::Warm);
+                Place::wait(&settings, reloads, role, &scheduling, warm, &stop, &mut |_, _| ())
+            });
+            // Longer than it takes to attach.
+            std::thread::sleep(Duration::from_millis(300));
+            let during = entries(folder.path());
+            drop(taking_over);
+            wait_until("it attaches", || entries(folder.path()) > before + 1);
+            stop.request();
+            assert!(next.join().unwrap().unwrap().is_none());
+            assert_eq!(during, before, "it has attached while another process took the role over");
+        });
+    }
 }

@@ -186,31 +186,40 @@ pub(super) struct TakeOver {
     ended_at: MonotonicNs,
 }
 
+/// Takes the place of the standby of the role `name`, once the process that takes the role over, if one does,
+/// is up; `None` if `stop` was requested meanwhile.
+pub(super) fn take_place(
+    settings: &Settings,
+    name: &str,
+    stop: &Stop,
+) -> Result<Option<RoleLock>, RoleError> {
+    let (root, instance) = (root_of(settings), &settings.instance);
+    let give_up_at = clock::monotonic().plus_ms(PLACE_MS);
+    loop {
+        match RoleLock::acquire_standby(&root, instance, name) {
+            Ok(lock) => return Ok(Some(lock)),
+            Err(ShmError::AlreadyServed { .. }) if clock::monotonic() < give_up_at => {}
+            // Names the process that serves the role, not the one that waits for it.
+            Err(taken @ ShmError::AlreadyServed { .. }) => {
+                return Err(RoleLock::acquire(&root, instance, name).err().unwrap_or(taken).into());
+            }
+            Err(error) => return Err(error.into()),
+        }
+        if stop.is_requested() {
+            return Ok(None);
+        }
+        pause(Duration::from_millis(POLL_MS.into()));
+    }
+}
+
 impl Waiting {
-    /// Takes the place of the standby of the role `name`; `None` if `stop` was requested meanwhile.
+    /// Begins to wait for the role `name`; `lock` is the place of its standby.
     pub fn open(
         settings: &Settings,
+        lock: RoleLock,
         (role, name): (ProcessRole, &str),
         boards: &Boards,
-        stop: &Stop,
-    ) -> Result<Option<Self>, RoleError> {
-        let (root, instance) = (root_of(settings), &settings.instance);
-        let give_up_at = clock::monotonic().plus_ms(PLACE_MS);
-        let lock = loop {
-            match RoleLock::acquire_standby(&root, instance, name) {
-                Ok(lock) => break lock,
-                Err(ShmError::AlreadyServed { .. }) if clock::monotonic() < give_up_at => {}
-                // Names the process that serves the role, not the one that waits for it.
-                Err(taken @ ShmError::AlreadyServed { .. }) => {
-                    return Err(RoleLock::acquire(&root, instance, name).err().unwrap_or(taken).into());
-                }
-                Err(error) => return Err(error.into()),
-            }
-            if stop.is_requested() {
-                return Ok(None);
-            }
-            pause(Duration::from_millis(POLL_MS.into()));
-        };
+    ) -> io::Result<Self> {
         let listener = listen_at(&lock.standby_socket())?;
         // Its supervisor may keep sockets of a time when this process, or the one before, had the role.
         drop(kept_sockets::inherited());
@@ -219,7 +228,7 @@ impl Waiting {
         let mut board = boards.standby_writer(role);
         board.update(|board| board.pid = std::process::id().into());
         info!(role = name, "standby: waits until the process that serves the role ends");
-        Ok(Some(Self {
+        Ok(Self {
             lock,
             board,
             role,
@@ -232,7 +241,7 @@ impl Waiting {
             cause: TakeOverCause::Ended,
             ended_at: MonotonicNs(0),
             fences: std::env::var_os(NO_WATCHDOG_VARIABLE).is_none(),
-        }))
+        })
     }
 
     /// Waits until the role is free, and takes it; `None` if `stop` was requested meanwhile. If the active
