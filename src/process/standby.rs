@@ -144,8 +144,7 @@ impl Active {
                  another container, or ProtectProc of its service hides it"
             );
         }
-        let (role, now) = ((role, boards), clock::monotonic());
-        let threads = BlockedThreads::of(pid, role, STOPPED_POLL_MS.into(), now);
+        let threads = BlockedThreads::of(pid, (role, boards), STOPPED_POLL_MS.into(), clock::monotonic());
         if let (Ok(_), Err(error)) = (&stat, &threads) {
             warn!(%pid, %error, "standby: cannot see the threads of the active process, and notices later if it hangs");
         }
@@ -318,7 +317,7 @@ impl Waiting {
                 Err(error) => return Err(error.into()),
                 Ok(_) => break,
             }
-            // Nothing but this check is done so often: it takes 30 µs of CPU time, most of them to wake up.
+            // Nothing but this check is done so often: it takes 30 to 100 µs of CPU time, most to wake up.
             if let Some(active) = self.active.as_mut().filter(|_| checks) {
                 active.check(&self.sockets, self.board.get());
             }

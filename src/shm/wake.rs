@@ -197,7 +197,7 @@ impl LaneSleeper {
 }
 
 /// Shows to another process whether a lane has work.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct LaneObserver {
     words: LaneWaker,
     /// The wake count when the lane had last run.

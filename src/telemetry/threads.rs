@@ -24,7 +24,7 @@ impl Thread {
     /// The first field of `schedstat` is the CPU time, the first one after the name in parentheses in `stat`
     /// is the state (proc(5)).
     fn parse(id: u64, schedstat: &str, stat: &str) -> Option<Self> {
-        let cpu_ns = schedstat.split_whitespace().next()?.parse().ok()?;
+        let cpu_ns = cpu_ns(schedstat)?;
         let (_, fields) = stat.rsplit_once(')')?;
         Some(Self { id, cpu_ns, ready: fields.trim_start().starts_with(READY) })
     }
@@ -38,6 +38,11 @@ impl Thread {
         };
         folders(pid).filter_map(read).collect()
     }
+}
+
+/// The CPU time in the `schedstat` of a thread.
+fn cpu_ns(schedstat: &str) -> Option<u64> {
+    schedstat.split_whitespace().next()?.parse().ok()
 }
 
 /// The folders of the threads of a process.
@@ -88,9 +93,8 @@ impl ThreadFiles {
     pub fn has_run(&mut self) -> bool {
         let mut bytes = [0; 64];
         let length = self.schedstat.read_at(&mut bytes, 0).unwrap_or(0);
-        let cpu_ns = bytes[..length].iter().map_while(|digit| char::from(*digit).to_digit(10));
-        let cpu_ns = cpu_ns.fold(0_u64, |sum, digit| sum.wrapping_mul(10).wrapping_add(digit.into()));
         // A thread that has ended never runs again, and is not ready.
+        let cpu_ns = str::from_utf8(&bytes[..length]).ok().and_then(cpu_ns).unwrap_or(0);
         std::mem::replace(&mut self.cpu_ns, cpu_ns) != cpu_ns
             || self.stat.state().is_some_and(|state| READY.contains(&state))
     }

@@ -36,7 +36,7 @@ pub const fn may_fence(taken_over_at: MonotonicNs, now: MonotonicNs) -> bool {
 /// before its standby kills it, in milliseconds. Each take-over in a row doubles it: if the machine is so
 /// slow that working processes are killed, they are so less and less often.
 pub fn hang_limit_ms(record: &StandbyRecord, routes: usize, now: MonotonicNs) -> u64 {
-    let doublings = if is_recent(record, now) { record.in_a_row.min(2) } else { 0 };
+    let doublings = recent_in_a_row(record, now).min(2);
     let once_ms = (routes as u64).saturating_mul(HANG_MS_PER_ROUTE).saturating_add(HANG_MS);
     (once_ms.min(MAX_HANG_MS) << doublings).min(MAX_HANG_MS)
 }
@@ -44,21 +44,24 @@ pub fn hang_limit_ms(record: &StandbyRecord, routes: usize, now: MonotonicNs) ->
 /// How long a thread of the active process of a role may have work and not run, `now`, before the standby
 /// kills the process, in milliseconds. Each take-over in a row doubles it.
 pub fn blocked_limit_ms(record: &StandbyRecord, now: MonotonicNs) -> u64 {
-    let doublings = if is_recent(record, now) { record.in_a_row.min(MAX_BLOCKED_DOUBLINGS) } else { 0 };
-    BLOCKED_MS << doublings
+    BLOCKED_MS << recent_in_a_row(record, now).min(MAX_BLOCKED_DOUBLINGS)
 }
 
 /// How many take-overs have followed each other within a minute, with one that happens `now` for `cause`
 /// after those of `former`. A process that was asked to end hands over without a fault, which does not count.
 pub fn take_overs_in_a_row(former: &StandbyRecord, cause: TakeOverCause, now: MonotonicNs) -> u64 {
-    let before = if is_recent(former, now) { former.in_a_row } else { 0 };
-    before.saturating_add((cause != TakeOverCause::HandedOver).into())
+    recent_in_a_row(former, now).saturating_add((cause != TakeOverCause::HandedOver).into())
 }
 
 /// Whether the active process of a role fails again and again, `now`: subscribers miss no sample as long as a
 /// standby is there in time, but its start takes longer than the process lives.
 pub const fn is_take_over_storm(record: &StandbyRecord, now: MonotonicNs) -> bool {
     is_recent(record, now) && record.in_a_row >= STORM
+}
+
+/// How many take-overs have followed each other, if the last one was within a minute.
+const fn recent_in_a_row(record: &StandbyRecord, now: MonotonicNs) -> u64 {
+    if is_recent(record, now) { record.in_a_row } else { 0 }
 }
 
 const fn is_recent(record: &StandbyRecord, now: MonotonicNs) -> bool {
