@@ -1676,8 +1676,11 @@ impl Writer {
           // HEARTBEAT tells of for history: that must come before the first sample.
           // A reader that was matched anew on its side asks so as well, also one that
           // has acknowledged everything before.
+          // What is not sent yet does not count: a reader requests at once all that a
+          // HEARTBEAT tells of, and would get twice what is sent meanwhile.
+          let last_advertised = self.last_advertised();
           let knows_nothing = an.reader_sn_state.base() < SequenceNumber::from(1);
-          let has_nothing = last_seq < SequenceNumber::from(1);
+          let has_nothing = last_advertised < SequenceNumber::from(1);
           let requests_nothing = an.reader_sn_state.iter().next().is_none();
           let requests_unoffered = an
             .reader_sn_state
@@ -1708,7 +1711,7 @@ impl Writer {
             && (knows_nothing
               || has_nothing
               || went_back
-              || (!has_progressed && reader_proxy.all_acked_before <= last_seq))
+              || (!has_progressed && reader_proxy.all_acked_before <= last_advertised))
             && !reader_proxy.repair_frags_requested()
           {
             let hb_message = MessageBuilder::new()
@@ -1725,7 +1728,7 @@ impl Writer {
                 } else {
                   max(advertised_first, reader_proxy.first_offered())
                 },
-                last_seq,
+                last_advertised,
                 self.next_heartbeat_count(),
                 self.endianness,
                 reader_guid.entity_id,
@@ -4879,6 +4882,27 @@ mod tests {
       assert_eq!(heartbeats_after_ack_before(5), 1, "it says so again");
       assert_eq!(heartbeats_after_ack_before(6), 0, "it has everything");
       assert!(f.next_repair_event(StdDuration::from_millis(50)).is_none());
+    }
+
+    // As when the Writer is behind the application: a reader requests all that it hears of, and
+    // each of those samples would be sent to it twice.
+    #[test]
+    fn a_reader_that_wants_an_answer_hears_only_of_samples_that_were_sent() {
+      let (mut f, socket) = with_socket();
+      write(&f, 5, 8);
+      f.writer.set_last_sent(SequenceNumber::new(2));
+      let mut count = 1;
+      let mut heartbeats_after_ack_before = |base| {
+        count += 1;
+        acknowledge(&mut f, base, &[], count);
+        let (samples, heartbeats) = received_messages(&socket);
+        assert_eq!(samples, 0);
+        heartbeats.into_iter().map(|(_, last)| last).collect::<Vec<_>>()
+      };
+      assert_eq!(heartbeats_after_ack_before(2), []);
+      assert_eq!(heartbeats_after_ack_before(2), [2], "it says so again");
+      assert_eq!(heartbeats_after_ack_before(3), []);
+      assert_eq!(heartbeats_after_ack_before(3), [], "it has what was sent");
     }
 
     // Its participant discarded ours and has matched it anew: it begins with an
