@@ -325,11 +325,21 @@ mod tests {
         let publisher = other.create_publisher(&qos).unwrap();
         let kind = super::super::rustdds::TopicKind::NoKey;
         let topic = other.create_topic("many".to_owned(), "T".to_owned(), &qos, kind).unwrap();
-        let writers: Vec<_> = (0..MAX_WAITING_CHANGES + 200)
-            .map(|_| publisher.create_datawriter_no_key_cdr::<u32>(&topic, None).unwrap())
-            .collect();
-        while participant.discovered_writers().len() < writers.len() {
-            std::thread::sleep(Duration::from_millis(20));
+        let mut writers = Vec::new();
+        while writers.len() < MAX_WAITING_CHANGES + 200 {
+            // The library announces at most 512 of those that are created while its thread of discovery waits
+            // for a CPU.
+            writers.extend(
+                (0..256).map(|_| publisher.create_datawriter_no_key_cdr::<u32>(&topic, None).unwrap()),
+            );
+            let found = || participant.discovered_writers().len();
+            for _ in 0..3_000 {
+                if found() == writers.len() {
+                    break;
+                }
+                std::thread::sleep(Duration::from_millis(20));
+            }
+            assert_eq!(found(), writers.len(), "writers discovered within a minute");
         }
 
         let mut told = BTreeSet::new();
