@@ -213,6 +213,7 @@ pub fn main() -> ExitCode {
         Command::DemoPublisher(arguments) => Ok(demo::publisher(&arguments)),
         Command::DemoSubscriber(arguments) => Ok(demo::subscriber(&arguments)),
     };
+    telemetry::flush_logs();
     ended.unwrap_or_else(|code| code)
 }
 

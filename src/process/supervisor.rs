@@ -5,7 +5,7 @@
 //! supervisor: each asks the kernel for SIGTERM when its parent dies, whatever the parent dies of.
 
 use std::ffi::OsString;
-use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
+use std::io::{self, BufRead, BufReader, ErrorKind, Read};
 use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
@@ -30,7 +30,7 @@ use crate::config::{Configuration, Settings, Standby};
 use crate::model::{MonotonicNs, TrafficClass};
 use crate::policy::{ChildExit, GiveUpReason, HangWatch, RestartBackoff, RestartDecision};
 use crate::shm::{RoleLock, ShmError, root_of};
-use crate::telemetry::{ProcessReading, Snapshot, Starvation};
+use crate::telemetry::{ProcessReading, Snapshot, Starvation, flush_logs, write_log_line};
 
 /// Interval at which the supervisor checks for requests, and its children if no signal tells that one ended.
 const POLL_MS: u64 = 20;
@@ -105,6 +105,7 @@ pub fn end_with_supervisor() {
     // The supervisor may have died before the call above.
     if getppid() != Pid::from_raw(supervisor) {
         error!("the supervisor has already ended");
+        flush_logs();
         std::process::exit(1);
     }
 }
@@ -539,6 +540,6 @@ fn forward_log(name: &str, log: impl io::Read) {
     for line in BufReader::new(log).split(b'\n').map_while(Result::ok) {
         let line = [format!("[{name}] ").as_bytes(), &line, b"\n"].concat();
         // A closed stderr leaves no place to report the failure.
-        let _ = io::stderr().lock().write_all(&line);
+        let _ = write_log_line(&line);
     }
 }

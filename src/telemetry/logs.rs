@@ -10,6 +10,7 @@ use tracing_subscriber::{EnvFilter, Registry, reload};
 
 use super::journal::Journal;
 use super::log_limit::LogLimit;
+use super::log_writer::LogLines;
 use crate::config::Verbosity;
 
 /// The handle that changes the filter; set only when `RUST_LOG` is unset and the configuration decides.
@@ -18,7 +19,8 @@ static CONFIGURED: OnceLock<reload::Handle<EnvFilter, Registry>> = OnceLock::new
 /// Starts logging to stderr, or to the journal when stderr is connected to it, as in a systemd service.
 ///
 /// `RUST_LOG` sets the filter. Without it, [`set_verbosity`] does, and [`Verbosity::Info`] applies until
-/// then. Events of libraries that use the `log` crate are logged, too.
+/// then. Events of libraries that use the `log` crate are logged, too. A program calls
+/// [`flush_logs`](super::flush_logs) before it ends.
 pub fn start_logs() {
     let environment = std::env::var(EnvFilter::DEFAULT_ENV).ok().filter(|text| !text.is_empty());
     let from_environment = environment.and_then(|text| EnvFilter::try_new(text).ok());
@@ -27,7 +29,7 @@ pub fn start_logs() {
     let journal = Journal::for_log(std::io::stderr(), std::env::var_os("JOURNAL_STREAM"));
     let lines = journal.is_none().then(|| {
         tracing_subscriber::fmt::layer()
-            .with_writer(std::io::stderr)
+            .with_writer(|| LogLines)
             // Otherwise the layer reports a closed stderr, such as that of a closed terminal, on stderr
             // itself, which fails and panics.
             .log_internal_errors(false)

@@ -8,7 +8,8 @@ use nix::sys::signal::Signal;
 use nix::unistd::Pid;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, NO_STANDBYS, NONCRITICAL, SCAN, outputs};
-use support::bridge::Bridge;
+use support::bridge::{Bridge, program};
+use support::netns::Net;
 use support::peer::{Peer, Received, RunningPeer, Sent};
 use support::process::{Process, signal};
 
@@ -95,6 +96,36 @@ fn a_noncritical_egress_stopped_for_ten_seconds_and_killed_five_times_costs_no_c
     flow.end_whole();
     bed.wait_accounted();
     slow.end::<Received>().assert_sound();
+    bed.end();
+}
+
+/// As when the terminal of `up` is paused, or was reached over a link that is down.
+#[test]
+fn samples_flow_and_a_process_is_restarted_while_nobody_reads_the_log() {
+    let test = "samples_flow_and_a_process_is_restarted_while_nobody_reads_the_log";
+    if let Some(reason) = support::testbed_missing() {
+        return support::skip(test, &reason);
+    }
+    let net = Net::new(&["publisher", "bridge", "critical", "slow"]);
+    let bridge = Bridge::new(&format!("instance: {{instance}}\n{SCAN}{NO_STANDBYS}"));
+    let mut up = net.host("bridge").command(program());
+    up.args(["up", "--config"]).arg(bridge.config()).envs([("NO_COLOR", "1"), ("RUST_LOG", "debug")]);
+    let bed = Bed { up: Process::spawn("up", up), bridge, net };
+    bed.wait_up();
+    let flow = Flow::start(&bed);
+    let unread = bed.up.leave_log_unread();
+    flow.flow_for(5);
+    let pid = |status: &Value| {
+        let mut processes = status["processes"].as_array().unwrap().iter();
+        processes.find(|one| one["name"] == "control" && one["state"] == "running")?["pid"].as_i64()
+    };
+    let before = pid(&bed.bridge.status()).unwrap();
+    signal(i32::try_from(before).unwrap(), Signal::SIGKILL);
+    bed.bridge.wait_status("another control", |status| pid(status).is_some_and(|now| now != before));
+    flow.flow_for(1);
+    drop(unread);
+    bed.up.wait_for_log("lines of the log, because stderr was not read");
+    flow.end_whole();
     bed.end();
 }
 

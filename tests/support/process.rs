@@ -3,7 +3,7 @@
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, ExitStatus, Stdio};
-use std::sync::{Arc, Condvar, Mutex};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::time::Instant;
 
 use nix::sys::signal::{Signal, kill, killpg};
@@ -26,6 +26,8 @@ pub fn memory_kib(pid: i32, field: &str) -> i64 {
 struct Lines {
     state: Mutex<LinesState>,
     changed: Condvar,
+    /// Held while nobody is to read the stream.
+    reading: Mutex<()>,
 }
 
 #[derive(Default)]
@@ -42,7 +44,11 @@ impl Lines {
             // Invalid UTF-8 is replaced, so that a log never makes a test fail.
             let mut stream = BufReader::new(stream);
             let mut line = Vec::new();
-            while matches!(stream.read_until(b'\n', &mut line), Ok(count) if count > 0) {
+            loop {
+                drop(sink.reading.lock());
+                if !matches!(stream.read_until(b'\n', &mut line), Ok(count) if count > 0) {
+                    break;
+                }
                 let text = String::from_utf8_lossy(&line).trim_end().to_owned();
                 sink.state.lock().unwrap().lines.push(text);
                 sink.changed.notify_all();
@@ -54,6 +60,9 @@ impl Lines {
         lines
     }
 }
+
+/// Keeps a [`Process`]'s stderr from being read.
+pub struct UnreadLog<'a>(#[allow(dead_code, reason = "holds the lock")] MutexGuard<'a, ()>);
 
 /// A child process, the leader of its own process group.
 ///
@@ -178,6 +187,11 @@ impl Process {
     /// Its output on stderr so far.
     pub fn log(&self) -> String {
         self.stderr.state.lock().unwrap().lines.join("\n")
+    }
+
+    /// Nobody reads its stderr while the returned guard exists.
+    pub fn leave_log_unread(&self) -> UnreadLog<'_> {
+        UnreadLog(self.stderr.reading.lock().unwrap())
     }
 
     /// Waits until `find` returns a value for a line of stdout, from line `from` on; returns the value and

@@ -39,13 +39,15 @@ pub fn main() -> ExitCode {
     // clap prints help and errors itself, and exits with 0 or 2.
     let cli = Cli::parse();
     telemetry::start_logs();
-    match cli.command {
+    let ended = match cli.command {
         Command::List(folder) => runs::list(&folder),
         Command::Run(arguments) => runs::run(&arguments),
         Command::Matrix(arguments) => runs::matrix(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Impair(arguments) => impair::run(&arguments),
-    }
+    };
+    telemetry::flush_logs();
+    ended
 }
 
 /// Prints why a command failed; returns its exit code.
