@@ -1,5 +1,5 @@
-//! Writes the lines of the log to stderr from a thread of its own, so that no other thread waits for whoever
-//! reads stderr: a terminal that is paused, or reached over a link that is down, or another program.
+//! Writes the lines of the log to stderr from a thread of its own, so that no other thread blocks when stderr
+//! is not read: a terminal that is paused or on the other side of a link that is down, or a full pipe.
 
 use std::io::{self, Write};
 use std::sync::atomic::{AtomicU64, Ordering};

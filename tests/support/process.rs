@@ -26,7 +26,7 @@ pub fn memory_kib(pid: i32, field: &str) -> i64 {
 struct Lines {
     state: Mutex<LinesState>,
     changed: Condvar,
-    /// Held while nobody is to read the stream.
+    /// While it is locked, the thread does not read the stream.
     reading: Mutex<()>,
 }
 
