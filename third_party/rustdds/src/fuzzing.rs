@@ -152,6 +152,7 @@ pub fn receive<'a>(reliable: bool, datagrams: impl Iterator<Item = &'a [u8]>) {
       poll_event_sender,
       security_plugins: None,
       discovery_notify: None,
+      taken: Default::default(),
     },
     Rc::clone(&udp_sender),
     new_shared_timer(),

@@ -1279,8 +1279,11 @@ impl InnerSubscriber {
       Err(e) => return create_error_poisoned!("Cannot lock DDScache. Error: {}", e),
     };
     // Update topic cache with DataReader's Qos
-    match topic_cache_handle.lock() {
-      Ok(mut tc) => tc.update_keep_limits(&qos),
+    let taken = match topic_cache_handle.lock() {
+      Ok(mut tc) => {
+        tc.update_keep_limits(&qos);
+        tc.taken.clone()
+      }
       Err(e) => return create_error_poisoned!("Cannot lock topic cache. Error: {}", e),
     };
 
@@ -1353,6 +1356,7 @@ impl InnerSubscriber {
       poll_event_sender,
       security_plugins: self.security_plugins_handle.clone(),
       discovery_notify,
+      taken,
     };
 
     // Construct security info if needed

@@ -1717,6 +1717,7 @@ pub(crate) mod tests {
       poll_event_sender: notification_event_sender1,
       security_plugins: None,
       discovery_notify: None,
+      taken: BTreeMap::new(),
     };
 
     // Add the reader to the database and verify the info is updated
@@ -1766,6 +1767,7 @@ pub(crate) mod tests {
       poll_event_sender: notification_event_sender2,
       security_plugins: None,
       discovery_notify: None,
+      taken: BTreeMap::new(),
     };
 
     // Add the second reader to the database and verify the info is updated

@@ -1721,6 +1721,7 @@ mod tests {
         poll_event_sender: notification_event_sender,
         security_plugins: None,
         discovery_notify: None,
+        taken: BTreeMap::new(),
       };
 
       reader_guids.push(new_reader_ing.guid);

@@ -1332,6 +1332,7 @@ mod tests {
       poll_event_sender,
       security_plugins: None,
       discovery_notify: None,
+      taken: BTreeMap::new(),
     };
     let mut reader = Reader::new(
       ingredients,
@@ -1537,6 +1538,7 @@ mod tests {
       poll_event_sender: notification_event_sender,
       security_plugins: None,
       discovery_notify: None,
+      taken: BTreeMap::new(),
     };
 
     let mut new_reader = Reader::new(

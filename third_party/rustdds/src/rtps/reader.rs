@@ -88,6 +88,9 @@ pub(crate) struct ReaderIngredients {
   pub data_reader_command_receiver: WakeReceiver<ReaderCommand>,
   pub(crate) data_reader_waker: Arc<Mutex<Option<Waker>>>,
   pub(crate) poll_event_sender: mio_source::PollEventSender,
+  /// What the application has taken of each writer before. The topic's cache has that of
+  /// the latest reader of the topic.
+  pub(crate) taken: BTreeMap<GUID, SequenceNumber>,
   /// When this reader is a built-in discovery reader, cache changes also wake
   /// Discovery's mio 1.2 poll with the reader's discovery token.
   pub(crate) discovery_notify: Option<(ReadySender<mio1::Token>, mio1::Token)>,
@@ -160,6 +163,7 @@ pub(crate) struct Reader {
   data_reader_waker: Arc<Mutex<Option<Waker>>>,
   poll_event_sender: mio_source::PollEventSender,
   discovery_notify: Option<(ReadySender<mio1::Token>, mio1::Token)>,
+  taken: BTreeMap<GUID, SequenceNumber>,
 
   participant_status_sender: StatusChannelSender<DomainParticipantStatusEvent>,
 
@@ -288,6 +292,7 @@ impl Reader {
       data_reader_waker: i.data_reader_waker,
       poll_event_sender: i.poll_event_sender,
       discovery_notify: i.discovery_notify,
+      taken: i.taken,
       participant_status_sender,
 
       security_plugins: i.security_plugins,
@@ -532,8 +537,7 @@ impl Reader {
       None => {
         // success, update or insert
         let mut proxy = proxy;
-        let taken = self.acquire_the_topic_cache_guard().taken.get(&writer).copied();
-        if let Some(taken) = taken {
+        if let Some(taken) = self.taken.get(&writer) {
           // Neither requested nor waited for.
           proxy.irrelevant_changes_up_to(taken.plus_1());
         }
@@ -1772,6 +1776,7 @@ mod tests {
       poll_event_sender: notification_event_sender,
       security_plugins: None,
       discovery_notify: None,
+      taken: BTreeMap::new(),
     };
     let mut reader = Reader::new(
       reader_ing,
@@ -1859,6 +1864,7 @@ mod tests {
       poll_event_sender: notification_event_sender,
       security_plugins: None,
       discovery_notify: None,
+      taken: BTreeMap::new(),
     };
     let mut reader = Reader::new(
       reader_ing,
@@ -1935,12 +1941,6 @@ mod tests {
       &reliable_qos,
     );
     let writer_guid = GUID::dummy_test_guid(EntityKind::WRITER_NO_KEY_USER_DEFINED);
-    topic_cache_handle
-      .lock()
-      .unwrap()
-      .taken
-      .insert(writer_guid, SequenceNumber::new(5));
-
     let (notification_sender, _notification_receiver) =
       crate::mio_source::notification_channel(100);
     let (_event_source, poll_event_sender) = mio_source::make_poll_channel().unwrap();
@@ -1963,6 +1963,7 @@ mod tests {
         poll_event_sender,
         security_plugins: None,
         discovery_notify: None,
+        taken: BTreeMap::from([(writer_guid, SequenceNumber::new(5))]),
       },
       Rc::new(UDPSender::new(0).unwrap()),
       new_shared_timer(),
@@ -2013,6 +2014,7 @@ mod tests {
         poll_event_sender,
         security_plugins: None,
         discovery_notify: None,
+        taken: BTreeMap::new(),
       },
       Rc::new(UDPSender::new(0).unwrap()),
       new_shared_timer(),
@@ -2067,6 +2069,7 @@ mod tests {
         poll_event_sender,
         security_plugins: None,
         discovery_notify: None,
+        taken: BTreeMap::new(),
       },
       Rc::new(UDPSender::new(0).unwrap()),
       new_shared_timer(),
@@ -2145,6 +2148,7 @@ mod tests {
       poll_event_sender: notification_event_sender,
       security_plugins: None,
       discovery_notify: None,
+      taken: BTreeMap::new(),
     };
     let mut reader = Reader::new(
       reader_ing,
@@ -2256,6 +2260,7 @@ mod tests {
       poll_event_sender: notification_event_sender,
       security_plugins: None,
       discovery_notify: None,
+      taken: BTreeMap::new(),
     };
     let mut reader = Reader::new(
       reader_ing,
@@ -2396,6 +2401,7 @@ mod tests {
       poll_event_sender: notification_event_sender,
       security_plugins: None,
       discovery_notify: None,
+      taken: BTreeMap::new(),
     };
     let mut reader = Reader::new(
       reader_ing,
@@ -2487,6 +2493,7 @@ mod tests {
         poll_event_sender,
         security_plugins: None,
         discovery_notify: None,
+        taken: BTreeMap::new(),
       },
       Rc::new(UDPSender::new(0).unwrap()),
       new_shared_timer(),

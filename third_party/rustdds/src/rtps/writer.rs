@@ -5141,6 +5141,7 @@ mod tests {
           encoding: RepresentationIdentifier::CDR_LE,
           encoding_options: [0, 0],
           source_timestamp: None,
+          history_source: None,
         };
         keep_last_continuing(crate::ContinuedWriter {
           samples: [37, 38, 40, 41].map(sample).into(),
@@ -5197,6 +5198,7 @@ mod tests {
         encoding: RepresentationIdentifier::CDR_LE,
         encoding_options: [0, 0],
         source_timestamp: None,
+        history_source: None,
       };
       let continuing = || {
         let f = keep_last_continuing(crate::ContinuedWriter {

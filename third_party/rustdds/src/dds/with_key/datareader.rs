@@ -1266,6 +1266,7 @@ mod tests {
       poll_event_sender: notification_event_sender,
       security_plugins: None,
       discovery_notify: None,
+      taken: Default::default(),
     };
 
     let mut reader = Reader::new(
@@ -1451,6 +1452,7 @@ mod tests {
       poll_event_sender: notification_event_sender,
       security_plugins: None,
       discovery_notify: None,
+      taken: Default::default(),
     };
 
     let mut reader = Reader::new(
