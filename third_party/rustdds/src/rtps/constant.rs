@@ -46,6 +46,13 @@ pub const MAX_REPAIRS_UNDER_WAY: usize = 1024;
 // Table 8.60 names this heartbeatResponseDelay and defaults it to 500 ms.
 pub const ACKNACK_DELAY: Duration = Duration::from_millis(1);
 
+// How long a Reliable Reader waits before it requests the samples of a request again:
+// the first of these, and the second for each requested sample, so 28 ms for 256. Of a
+// Writer with 1,000 samples to repair, an ACKNACK for each HEARTBEAT, which comes with
+// each repair, would request each sample many times, and Cyclone DDS sends it each time.
+pub const REQUEST_AGAIN_AFTER: Duration = Duration::from_millis(2);
+pub const REQUEST_AGAIN_AFTER_SAMPLE: Duration = Duration::from_micros(100);
+
 // Time between two repair rounds (SendRepairData, SendRepairFrags) for one
 // reader, and the backoff while the reader's send socket has queued control
 // datagrams. A Writer with a finite, positive Deadline uses a fifth of it,

@@ -154,9 +154,8 @@ pub(crate) struct Reader {
   // Whether further RELIABLE Writers are left to another Reader of the topic.
   ignores_reliable_writers: bool,
 
-  // Writers whose samples are to be acknowledged when the timer set for it
-  // expires, and where to. See `ACKNACK_DELAY`.
-  delayed_acknacks: Vec<(GUID, Vec<Locator>)>,
+  // Answers to HEARTBEATs that are not sent yet, one for each Writer.
+  delayed_acknacks: Vec<DelayedAcknack>,
 
   pub(crate) timed_event_timer: SharedTimer<DpTimerEvent>,
   pub(crate) data_reader_command_receiver: WakeReceiver<ReaderCommand>,
@@ -169,6 +168,12 @@ pub(crate) struct Reader {
 
   #[allow(dead_code)] // to avoid warning if no security feature
   security_plugins: Option<SecurityPluginsHandle>,
+}
+
+struct DelayedAcknack {
+  writer: GUID,
+  destination: Vec<Locator>,
+  due: Instant,
 }
 
 // Where to answer a message of that Writer. A Writer announces an address for each
@@ -410,49 +415,147 @@ impl Reader {
     }
   }
 
-  fn delay_acknack(&mut self, writer_guid: GUID, reply_locators: &[Locator]) {
-    if self.delayed_acknacks.is_empty() {
-      self.timed_event_timer.borrow_mut().set_timeout(
-        ACKNACK_DELAY,
-        DpTimerEvent::Reader {
-          entity_id: self.my_guid.entity_id,
-          event: TimedEvent::SendDelayedAcknacks,
-        },
-      );
+  // Answers the latest HEARTBEAT of the Writer at that time, or earlier if an answer is
+  // due earlier.
+  fn delay_acknack(&mut self, writer: GUID, due: Instant, destination: &[Locator]) {
+    let delayed = self.delayed_acknacks.iter_mut().find(|delayed| delayed.writer == writer);
+    match delayed {
+      Some(delayed) if delayed.due <= due => return,
+      Some(delayed) => delayed.due = due,
+      None => self.delayed_acknacks.push(DelayedAcknack {
+        writer,
+        destination: destination.to_vec(),
+        due,
+      }),
     }
-    if !self.delayed_acknacks.iter().any(|(guid, _)| *guid == writer_guid) {
-      self
-        .delayed_acknacks
-        .push((writer_guid, reply_locators.to_vec()));
+    self.timed_event_timer.borrow_mut().set_timeout(
+      due.saturating_duration_since(Instant::now()),
+      DpTimerEvent::Reader {
+        entity_id: self.my_guid.entity_id,
+        event: TimedEvent::SendDelayedAcknacks,
+      },
+    );
+  }
+
+  // Sends the delayed answers that are due.
+  fn send_delayed_acknacks(&mut self) {
+    let now = Instant::now();
+    let mut place = 0;
+    while let Some(delayed) = self.delayed_acknacks.get(place) {
+      // Each has a timer event of its own.
+      if delayed.due > now {
+        place += 1;
+        continue;
+      }
+      let DelayedAcknack {
+        writer,
+        destination,
+        ..
+      } = self.delayed_acknacks.swap_remove(place);
+      if self.matched_writers.contains_key(&writer) {
+        self.with_mutable_writer_proxy(writer, |this, writer_proxy| {
+          this.answer_heartbeat(writer_proxy, now, &destination);
+        });
+      }
     }
   }
 
-  // Acknowledges what there is by now.
-  fn send_delayed_acknacks(&mut self) {
-    let mut delayed_acknacks = std::mem::take(&mut self.delayed_acknacks);
-    for (writer_guid, reply_locators) in delayed_acknacks.drain(..) {
-      let reader_id = self.entity_id();
-      let Some(writer_proxy) = self.matched_writer_mut(writer_guid) else {
-        continue; // gone
-      };
-      let acknack = AckNack {
-        reader_id,
-        writer_id: writer_guid.entity_id,
-        reader_sn_state: SequenceNumberSet::new_empty(writer_proxy.all_ackable_before()),
-        count: writer_proxy.next_ack_nack_sequence_number(),
-      };
-      self.send_acknack_to(
-        BitFlags::<ACKNACK_Flags>::from_flag(ACKNACK_Flags::Endianness)
-          | BitFlags::<ACKNACK_Flags>::from_flag(ACKNACK_Flags::Final),
-        acknack,
-        InfoDestination {
-          guid_prefix: writer_guid.prefix,
-        },
-        &reply_locators,
+  // Acknowledges what is received, and requests what is missing of the samples that the
+  // latest HEARTBEAT announced, but not what was requested lately: that is done later.
+  fn answer_heartbeat(
+    &mut self,
+    writer_proxy: &mut RtpsWriterProxy,
+    now: Instant,
+    destination: &[Locator],
+  ) {
+    let reader_id = self.entity_id();
+    let writer_guid = writer_proxy.remote_writer_guid;
+    let received_before = writer_proxy.all_ackable_before();
+    let missing = writer_proxy.missing_seqnums(received_before, writer_proxy.announced_last);
+    writer_proxy.begin_request(now);
+    let mut samples = BTreeSet::new();
+    let mut nackfrags = Vec::new();
+    let mut requests_later = false;
+    for &sn in &missing {
+      let is_partially_received = self.is_frag_partially_received(writer_guid, sn);
+      if writer_proxy.is_requested(sn, is_partially_received) {
+        requests_later = true;
+      } else if !is_partially_received {
+        samples.insert(sn);
+        writer_proxy.set_requested(sn, false);
+      } else if nackfrags.len() < NACK_FRAGS_MAX {
+        let room = NACK_FRAGS_MAX - nackfrags.len();
+        nackfrags.extend(self.nackfrags_for(writer_proxy, sn).take(room));
+        writer_proxy.set_requested(sn, true);
+      } else {
+        self.delay_acknack(writer_guid, now + ACKNACK_DELAY, destination);
+      }
+    }
+    if requests_later {
+      if let Some(again_at) = writer_proxy.request_again_at() {
+        self.delay_acknack(writer_guid, again_at, destination);
+      }
+      if samples.is_empty() && nackfrags.is_empty() {
+        return;
+      }
+    }
+    let acknack = AckNack {
+      reader_id,
+      writer_id: writer_guid.entity_id,
+      // What is before the base is acknowledged.
+      reader_sn_state: SequenceNumberSet::from_base_and_set(
+        missing.first().copied().unwrap_or(received_before),
+        &samples,
+      ),
+      count: writer_proxy.next_ack_nack_sequence_number(),
+    };
+    let info_dst = InfoDestination {
+      guid_prefix: writer_guid.prefix,
+    };
+    if !nackfrags.is_empty() {
+      self.send_nackfrags_to(
+        BitFlags::<NACKFRAG_Flags>::from_flag(NACKFRAG_Flags::Endianness),
+        nackfrags,
+        info_dst.clone(),
+        destination,
         writer_guid,
       );
     }
-    self.delayed_acknacks = delayed_acknacks; // keeps its capacity
+    self.send_acknack_to(
+      BitFlags::<ACKNACK_Flags>::from_flag(ACKNACK_Flags::Endianness)
+        | BitFlags::<ACKNACK_Flags>::from_flag(ACKNACK_Flags::Final),
+      acknack,
+      info_dst,
+      destination,
+      writer_guid,
+    );
+  }
+
+  // Requests the missing fragments of a sample. Each NACK_FRAG names 256 of them at most,
+  // which of a large sample in small fragments is little.
+  fn nackfrags_for<'a>(
+    &'a self,
+    writer_proxy: &'a mut RtpsWriterProxy,
+    writer_sn: SequenceNumber,
+  ) -> impl Iterator<Item = NackFrag> + 'a {
+    let writer_guid = writer_proxy.remote_writer_guid;
+    let mut missing_frags = self.missing_frags_for(writer_guid, writer_sn).peekable();
+    std::iter::from_fn(move || {
+      let first = *missing_frags.peek()?;
+      let mut missing_frags_set = BTreeSet::new();
+      while let Some(frag) =
+        missing_frags.next_if(|frag| u32::from(*frag) - u32::from(first) < NACK_FRAG_MAX_BITS)
+      {
+        missing_frags_set.insert(frag);
+      }
+      Some(NackFrag {
+        reader_id: self.entity_id(),
+        writer_id: writer_guid.entity_id,
+        writer_sn,
+        fragment_number_state: FragmentNumberSet::from_base_and_set(first, &missing_frags_set),
+        count: writer_proxy.next_ack_nack_sequence_number(),
+      })
+    })
   }
 
   pub fn process_command(&mut self) {
@@ -1144,8 +1247,7 @@ impl Reader {
           this.notify_cache_change();
         }
 
-        // let received_before = writer_proxy.all_ackable_before();
-        let reader_id = this.entity_id();
+        writer_proxy.announced_last = heartbeat.last_sn;
 
         // See if ACKNACK is needed, and generate one.
         let missing_seqnums = writer_proxy.missing_seqnums(heartbeat.first_sn, heartbeat.last_sn);
@@ -1159,132 +1261,20 @@ impl Reader {
         // having received all the data samples or may indicate that some data
         // samples are missing. The response may be delayed to avoid message storms.
 
-        if !missing_seqnums.is_empty() || !final_flag_set {
-          if missing_seqnums.is_empty()
-            && mr_state.follows_data
-            && reader_id.kind().is_user_defined()
-          {
-            this.delay_acknack(writer_guid, &reply_locators(mr_state, writer_proxy));
-            return true;
-          }
-
-          let mut partially_received = Vec::new();
-          // report of what we have.
-          // We claim to have received all SNs before "base" and produce a set of missing
-          // sequence numbers that are >= base.
-          let reader_sn_state = match missing_seqnums.first() {
-            Some(&first_missing) => {
-              // Here we assume missing_seqnums are returned in order.
-              // Limit the set to maximum that can be sent in acknack submessage.
-
-              SequenceNumberSet::from_base_and_set(
-                first_missing,
-                &missing_seqnums
-                  .iter()
-                  .copied()
-                  .take_while(|sn| sn < &(first_missing + SequenceNumber::new(256)))
-                  .filter(|sn| {
-                    if this.is_frag_partially_received(writer_guid, *sn) {
-                      partially_received.push(*sn);
-                      false
-                    } else {
-                      true
-                    }
-                  })
-                  .collect(),
-              )
-            }
-
-            // Nothing missing. Report that we have all we have.
-            None => SequenceNumberSet::new_empty(writer_proxy.all_ackable_before()),
-          };
-
-          let response_ack_nack = AckNack {
-            reader_id,
-            writer_id: heartbeat.writer_id,
-            reader_sn_state,
-            count: writer_proxy.next_ack_nack_sequence_number(),
-          };
-
-          // Sanity check
-          //
-          // Wrong. This sanity check is invalid. The condition
-          // ack_base > heartbeat.last_sn + 1
-          // May be legitimately true, if there are some changes available, and a GAP
-          // after that. E.g. HEARTBEAT 1..8 and GAP 9..10. Then acknack_base == 11
-          // and 11 > 8 + 1.
-          //
-          //
-          // if response_ack_nack.reader_sn_state.base() > heartbeat.last_sn +
-          // SequenceNumber::new(1) {   error!(
-          //     "OOPS! AckNack sanity check tripped: HEARTBEAT = {:?} ACKNACK = {:?}
-          // missing_seqnums = {:?} all_ackable_before = {:?} writer={:?}",
-          //     &heartbeat, &response_ack_nack, missing_seqnums,
-          // writer_proxy.all_ackable_before(), writer_guid,   );
-          // }
-
-          // The acknack can be sent now or later. The rest of the RTPS message
-          // needs to be constructed. p. 48
-          let acknack_flags = BitFlags::<ACKNACK_Flags>::from_flag(ACKNACK_Flags::Endianness)
-            | BitFlags::<ACKNACK_Flags>::from_flag(ACKNACK_Flags::Final);
-
-          let nackfrag_flags = BitFlags::<NACKFRAG_Flags>::from_flag(NACKFRAG_Flags::Endianness);
-
-          // send NackFrags, if any. Each names 256 fragments at most, which of a large
-          // sample in small fragments is little.
-          let mut nackfrags = Vec::new();
-          'samples: for sn in partially_received {
-            let mut missing_frags = this.missing_frags_for(writer_guid, sn).peekable();
-            while let Some(&first) = missing_frags.peek() {
-              if nackfrags.len() >= NACK_FRAGS_MAX {
-                break 'samples;
-              }
-              let mut missing_frags_set = BTreeSet::new();
-              while let Some(frag) = missing_frags
-                .next_if(|frag| u32::from(*frag) - u32::from(first) < NACK_FRAG_MAX_BITS)
-              {
-                missing_frags_set.insert(frag);
-              }
-              nackfrags.push(NackFrag {
-                reader_id,
-                writer_id: writer_proxy.remote_writer_guid.entity_id,
-                writer_sn: sn,
-                fragment_number_state: FragmentNumberSet::from_base_and_set(
-                  first,
-                  &missing_frags_set,
-                ),
-                count: writer_proxy.next_ack_nack_sequence_number(),
-              });
-            }
-          }
-
-          let reply_locators = reply_locators(mr_state, writer_proxy);
-          if !nackfrags.is_empty() {
-            this.send_nackfrags_to(
-              nackfrag_flags,
-              nackfrags,
-              InfoDestination {
-                guid_prefix: mr_state.source_guid_prefix,
-              },
-              &reply_locators,
-              writer_guid,
-            );
-          }
-
-          this.send_acknack_to(
-            acknack_flags,
-            response_ack_nack,
-            InfoDestination {
-              guid_prefix: mr_state.source_guid_prefix,
-            },
-            &reply_locators,
-            writer_guid,
-          );
-
-          return true;
+        if missing_seqnums.is_empty() && final_flag_set {
+          return false;
         }
-
-        false
+        let now = Instant::now();
+        let destination = reply_locators(mr_state, writer_proxy).into_owned();
+        if missing_seqnums.is_empty()
+          && mr_state.follows_data
+          && this.entity_id().kind().is_user_defined()
+        {
+          this.delay_acknack(writer_guid, now + ACKNACK_DELAY, &destination);
+        } else {
+          this.answer_heartbeat(writer_proxy, now, &destination);
+        }
+        true
       }) // worker fn
       .unwrap_or(false) // default false: no writer_proxy -> no acknack
   } // fn
@@ -1723,7 +1713,9 @@ mod tests {
 
   use crate::{
     dds::{qos::policy::Reliability, statusevents::sync_status_channel, typedesc::TypeDesc},
+    messages::submessages::submessage::ReaderSubmessage,
     polling::{new_shared_timer, wake_channel, LoopWaker},
+    rtps::submessage::SubmessageBody,
     structure::{dds_cache::DDSCache, duration::Duration, guid::EntityKind},
     QosPolicyBuilder,
   };
@@ -2526,5 +2518,167 @@ mod tests {
     assert_eq!(receive(&mut reader, 2, 1), 2);
     reader.remove_writer_proxy(writer_guid);
     assert_eq!(*lent.lock().unwrap(), 0);
+  }
+
+  // A RELIABLE Reader of a Writer to which it sends its requests.
+  struct Requesting {
+    reader: Reader,
+    writer: GUID,
+    socket: std::net::UdpSocket,
+    begin: Instant,
+  }
+
+  impl Requesting {
+    fn new() -> Self {
+      let qos = QosPolicyBuilder::new()
+        .reliability(Reliability::Reliable {
+          max_blocking_time: Duration::from_millis(100),
+        })
+        .build();
+      let topic_cache_handle = DDSCache::new().add_new_topic(
+        "test_name".to_string(),
+        TypeDesc::new("test_type".to_string()),
+        &qos,
+      );
+      let (notification_sender, _) = crate::mio_source::notification_channel(100);
+      let (_, poll_event_sender) = mio_source::make_poll_channel().unwrap();
+      let (status_sender, _) = sync_status_channel::<DataReaderStatus>(4).unwrap();
+      let (participant_status_sender, _) = sync_status_channel(16).unwrap();
+      let (_, data_reader_command_receiver) =
+        wake_channel::<ReaderCommand>(10, &LoopWaker::new());
+      let mut reader = Reader::new(
+        ReaderIngredients {
+          guid: GUID::dummy_test_guid(EntityKind::READER_NO_KEY_USER_DEFINED),
+          notification_sender,
+          status_sender,
+          topic_name: "test_name".to_string(),
+          topic_cache_handle,
+          like_stateless: false,
+          qos_policy: qos.clone(),
+          data_reader_command_receiver,
+          data_reader_waker: Arc::new(Mutex::new(None)),
+          poll_event_sender,
+          security_plugins: None,
+          discovery_notify: None,
+          taken: BTreeMap::new(),
+        },
+        Rc::new(UDPSender::new(0).unwrap()),
+        new_shared_timer(),
+        participant_status_sender,
+      );
+      let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+      let writer = GUID::dummy_test_guid(EntityKind::WRITER_NO_KEY_USER_DEFINED);
+      let locator = Locator::from(socket.local_addr().unwrap());
+      reader.matched_writer_add(writer, EntityId::UNKNOWN, vec![locator], vec![], &qos);
+      let begin = Instant::now();
+      let mut requesting = Self { reader, writer, socket, begin };
+      // The one that asks for a HEARTBEAT.
+      assert!(requesting.requests().is_some());
+      requesting
+    }
+
+    fn fragment(&mut self, sn: i64, number: u32) {
+      let fragment = DataFrag {
+        writer_id: self.writer.entity_id,
+        writer_sn: SequenceNumber::new(sn),
+        fragment_starting_num: FragmentNumber::new(number),
+        fragments_in_submessage: 1,
+        data_size: 16,
+        fragment_size: 8,
+        serialized_payload: bytes::Bytes::from_static(&[0; 8]),
+        ..DataFrag::default()
+      };
+      let mr_state = MessageReceiverState {
+        source_guid_prefix: self.writer.prefix,
+        ..Default::default()
+      };
+      self.reader.handle_datafrag_msg(&fragment, BitFlags::empty(), &mr_state);
+    }
+
+    // The samples that it requests at that time of those up to the last one, and those of
+    // which it requests fragments; `None` if it answers nothing.
+    fn answer(&mut self, last: i64, time: StdDuration) -> Option<(Vec<i64>, Vec<i64>)> {
+      let (now, locator) = (
+        self.begin + time,
+        Locator::from(self.socket.local_addr().unwrap()),
+      );
+      self
+        .reader
+        .with_mutable_writer_proxy(self.writer, |reader, writer_proxy| {
+          writer_proxy.announced_last = SequenceNumber::new(last);
+          reader.answer_heartbeat(writer_proxy, now, &[locator]);
+        });
+      self.requests()
+    }
+
+    // What was sent on the loopback interface has arrived.
+    fn requests(&mut self) -> Option<(Vec<i64>, Vec<i64>)> {
+      self.socket.set_nonblocking(true).unwrap();
+      let (mut samples, mut of_fragments, mut is_empty) = (vec![], vec![], true);
+      let mut buffer = [0; 2_000];
+      while let Ok(len) = self.socket.recv(&mut buffer) {
+        is_empty = false;
+        let message = Message::read_from_buffer(&bytes::Bytes::copy_from_slice(&buffer[..len])).unwrap();
+        for submessage in message.submessages {
+          match submessage.body {
+            SubmessageBody::Reader(ReaderSubmessage::AckNack(acknack, _)) => {
+              samples.extend(acknack.reader_sn_state.iter().map(i64::from));
+            }
+            SubmessageBody::Reader(ReaderSubmessage::NackFrag(nackfrag, _)) => {
+              of_fragments.push(i64::from(nackfrag.writer_sn));
+            }
+            _ => {}
+          }
+        }
+      }
+      (!is_empty).then_some((samples, of_fragments))
+    }
+
+    fn due(&self) -> Vec<StdDuration> {
+      let delayed = self.reader.delayed_acknacks.iter();
+      delayed.map(|delayed| delayed.due - self.begin).collect()
+    }
+  }
+
+  // With each sample that a Writer repairs comes a HEARTBEAT.
+  #[test]
+  fn a_sample_is_not_requested_again_until_it_can_have_come() {
+    let us = StdDuration::from_micros;
+    let mut r = Requesting::new();
+    assert_eq!(r.answer(3, us(0)), Some((vec![1, 2, 3], vec![])));
+    assert_eq!(r.answer(3, us(100)), None);
+    // 2 ms, and 0.1 ms for each.
+    assert_eq!(r.due(), [us(2_300)]);
+    // One that was not announced before is requested at once.
+    assert_eq!(r.answer(4, us(200)), Some((vec![4], vec![])));
+    assert_eq!(r.answer(4, us(2_399)), None);
+    assert_eq!(r.answer(4, us(2_400)), Some((vec![1, 2, 3, 4], vec![])));
+    // Nothing may come any more that has it answered.
+    std::thread::sleep(us(10_000));
+    assert_eq!(r.answer(4, us(2_500)), None);
+    r.reader.handle_timed_event(TimedEvent::SendDelayedAcknacks);
+    assert_eq!(r.requests(), Some((vec![1, 2, 3, 4], vec![])));
+    assert!(r.due().is_empty());
+  }
+
+  // Cyclone DDS answers the request for a sample with its first fragment only.
+  #[test]
+  fn the_fragments_of_a_requested_sample_are_requested_at_once() {
+    let us = StdDuration::from_micros;
+    let mut r = Requesting::new();
+    let all: Vec<i64> = (1..=20).collect();
+    assert_eq!(r.answer(20, us(0)), Some((all.clone(), vec![])));
+    for sn in 1..=20 {
+      r.fragment(sn, 1);
+    }
+    assert_eq!(r.answer(20, us(100)), Some((vec![], all[..16].to_vec())));
+    // The others a millisecond later, or with the next HEARTBEAT.
+    assert_eq!(r.due(), [us(1_100)]);
+    assert_eq!(r.answer(20, us(200)), Some((vec![], all[16..].to_vec())));
+    assert_eq!(r.answer(20, us(300)), None);
+    for sn in 1..=20 {
+      r.fragment(sn, 2);
+    }
+    assert_eq!(r.answer(20, us(400)), Some((vec![], vec![])), "acknowledged");
   }
 }

@@ -1,12 +1,17 @@
 use core::ops::Bound::{Included, Unbounded};
-use std::{cmp::max, collections::BTreeMap, sync::Arc};
+use std::{cmp::max, collections::BTreeMap, sync::Arc, time::Instant};
 
 #[allow(unused_imports)]
 use log::{debug, error, info, trace, warn};
 
 use crate::{
   discovery::sedp_messages::DiscoveredWriterData,
-  rtps::{constant::MAX_TRACKED_CHANGES_PER_WRITER, identity::UsedNumbers},
+  rtps::{
+    constant::{
+      MAX_TRACKED_CHANGES_PER_WRITER, REQUEST_AGAIN_AFTER, REQUEST_AGAIN_AFTER_SAMPLE,
+    },
+    identity::UsedNumbers,
+  },
   structure::{
     guid::{EntityId, GUID},
     locator::Locator,
@@ -79,6 +84,14 @@ pub(crate) struct RtpsWriterProxy {
   // These are used for quick tracking of
   last_received_sequence_number: SequenceNumber,
   last_received_timestamp: Timestamp,
+
+  // The last sample that the latest HEARTBEAT announced.
+  pub announced_last: SequenceNumber,
+  // Missing samples before these are not requested again before that time: those of which
+  // nothing was received, and those of which some fragments were.
+  requested_before: SequenceNumber,
+  fragments_requested_before: SequenceNumber,
+  request_again_at: Option<Instant>,
 }
 
 // Sequence numbers in an ACKNACK: RTPS v2.5 Section 8.3.5.5 SequenceNumberSet.
@@ -106,6 +119,10 @@ impl RtpsWriterProxy {
       ack_base: SequenceNumber::new(1),
       last_received_sequence_number: SequenceNumber::new(0),
       last_received_timestamp: Timestamp::INVALID,
+      announced_last: SequenceNumber::new(0),
+      requested_before: SequenceNumber::new(0),
+      fragments_requested_before: SequenceNumber::new(0),
+      request_again_at: None,
     }
   }
 
@@ -224,6 +241,40 @@ impl RtpsWriterProxy {
     }
 
     missing_seqnums
+  }
+
+  // Of the missing samples, those that were requested lately are not requested again, see
+  // `REQUEST_AGAIN_AFTER`. To be called before the samples to request are chosen.
+  pub fn begin_request(&mut self, now: Instant) {
+    if self.request_again_at.is_none_or(|again_at| again_at <= now) {
+      self.requested_before = SequenceNumber::new(0);
+      self.fragments_requested_before = SequenceNumber::new(0);
+      self.request_again_at = Some(now + REQUEST_AGAIN_AFTER);
+    }
+  }
+
+  // Whether the sample, or the fragments of it that are missing, were requested lately.
+  pub fn is_requested(&self, sn: SequenceNumber, is_partially_received: bool) -> bool {
+    match is_partially_received {
+      true => sn < self.fragments_requested_before,
+      false => sn < self.requested_before,
+    }
+  }
+
+  // Samples are requested in ascending order.
+  pub fn set_requested(&mut self, sn: SequenceNumber, is_partially_received: bool) {
+    match is_partially_received {
+      true => self.fragments_requested_before = sn.plus_1(),
+      false => self.requested_before = sn.plus_1(),
+    }
+    if let Some(again_at) = &mut self.request_again_at {
+      *again_at += REQUEST_AGAIN_AFTER_SAMPLE;
+    }
+  }
+
+  // When samples that were requested may be requested again.
+  pub fn request_again_at(&self) -> Option<Instant> {
+    self.request_again_at
   }
 
   // Check if we have already received this sequence number
@@ -373,6 +424,10 @@ impl RtpsWriterProxy {
       ack_base: SequenceNumber::default(),
       last_received_sequence_number: SequenceNumber::new(0),
       last_received_timestamp: Timestamp::INVALID,
+      announced_last: SequenceNumber::new(0),
+      requested_before: SequenceNumber::new(0),
+      fragments_requested_before: SequenceNumber::new(0),
+      request_again_at: None,
     }
   } // fn
 
