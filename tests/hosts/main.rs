@@ -29,6 +29,7 @@ mod parameters;
 mod patterns;
 mod qos_table;
 mod readers;
+mod repairs;
 mod responder;
 mod restarts;
 mod ros2;

@@ -56,7 +56,7 @@ fn number(value: &Value) -> u64 {
 }
 
 /// Waits until a standby of the role has the sockets of the active process, and returns the id of the latter.
-fn wait_standby(bed: &Bed, name: &str) -> i32 {
+pub fn wait_standby(bed: &Bed, name: &str) -> i32 {
     let what = format!("a standby of {name}");
     let status = bed.bridge.wait_status(&what, |status| {
         let process = process(status, name);

@@ -284,6 +284,14 @@ impl Host {
         ip(&format!("-n {} link set {} {state}", self.switch, self.port));
     }
 
+    /// The bytes that this host has sent on `eth0`.
+    pub fn sent_bytes(&self) -> u64 {
+        let counters = self.run("cat", &["/proc/net/dev"]);
+        let counters = counters.lines().find_map(|line| line.trim().strip_prefix("eth0:"));
+        // Eight columns of what it received come first.
+        counters.and_then(|counters| counters.split_whitespace().nth(8)?.parse().ok()).expect("an eth0")
+    }
+
     /// Sends a signal to every process on the host.
     pub fn signal_all(&self, signal: Signal) {
         let pids =

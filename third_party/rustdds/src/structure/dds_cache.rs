@@ -1,6 +1,9 @@
 use std::{
   cmp::max,
-  collections::{btree_map, BTreeMap, HashMap},
+  collections::{
+    btree_map::{self, Entry},
+    BTreeMap, HashMap,
+  },
   iter,
   ops::Bound::{Excluded, Included},
   sync::{Arc, Mutex},
@@ -22,7 +25,7 @@ use crate::{
   },
   rtps::constant::{
     builtin_topic_names::DCPS_PARTICIPANT, MAX_KEPT_BYTES_PER_BUILTIN_TOPIC,
-    MAX_WITHHELD_BYTES_PER_TOPIC,
+    MAX_TRACKED_CHANGES_PER_WRITER, MAX_WITHHELD_BYTES_PER_TOPIC,
   },
   structure::{duration::Duration, sequence_number::SequenceNumber, time::Timestamp},
   GUID,
@@ -169,6 +172,10 @@ pub(crate) struct TopicCache {
   // Initially, we consider the marker for each Writer (GUID) to be SequenceNumber::new(1)
   received_reliably_before: BTreeMap<GUID, SequenceNumber>,
 
+  // Of each Writer, the samples that became available at once when a missing one came, and
+  // that no Reliable DataReader has read since: the first of them, and the one after them.
+  unread: BTreeMap<GUID, (SequenceNumber, SequenceNumber)>,
+
   // Where the application wants samples of several fragments, if it does.
   pub(crate) lender: Lender,
 
@@ -199,6 +206,7 @@ impl TopicCache {
       added_since_collection: 0,
       sequence_numbers: BTreeMap::new(),
       received_reliably_before: BTreeMap::new(),
+      unread: BTreeMap::new(),
       lender: Lender::default(),
       taken: BTreeMap::new(),
       begin_instant: Timestamp::ZERO,
@@ -269,7 +277,35 @@ impl TopicCache {
     let marker = self.received_reliably_before.entry(writer).or_default();
     *marker = max(*marker, sn);
     self.advance_marker_over_present(writer);
+    self.keep_until_read(writer, prev_sn);
     prev_sn < self.reliable_before(writer)
+  }
+
+  // Keeps the samples that have become available at once, from that one on, until they are
+  // read: as many as a Reader tracks. They are more than what is kept by the number of
+  // samples if many were missing, and the oldest of them were received first.
+  fn keep_until_read(&mut self, writer: GUID, first: SequenceNumber) {
+    let before = self.reliable_before(writer);
+    let Some(numbers) = self.sequence_numbers.get(&writer) else {
+      return;
+    };
+    if before <= first.plus_1() || numbers.range(first..before).nth(1).is_none() {
+      return;
+    }
+    let (from, until) = self.unread.entry(writer).or_insert((first, before));
+    *until = before;
+    *from = max(*from, before - SequenceNumber::from(MAX_TRACKED_CHANGES_PER_WRITER));
+  }
+
+  // A Reliable DataReader has read the samples of the Writer up to that one.
+  pub fn set_read(&mut self, writer: GUID, up_to: SequenceNumber) {
+    if let Entry::Occupied(mut unread) = self.unread.entry(writer) {
+      let (from, until) = unread.get_mut();
+      *from = max(*from, up_to.plus_1());
+      if from >= until {
+        unread.remove();
+      }
+    }
   }
 
   // Samples present without a break right at the marker have nothing missing
@@ -298,6 +334,7 @@ impl TopicCache {
     if self.received_reliably_before.remove(&writer).is_none() {
       return;
     }
+    self.unread.remove(&writer);
     for instant in self
       .sequence_numbers
       .remove(&writer)
@@ -329,45 +366,60 @@ impl TopicCache {
     });
   }
 
-  // The oldest change that a Reliable DataReader cannot yet take, because an
-  // earlier sample from the same Writer is still missing: its receive timestamp,
-  // Writer and SequenceNumber.
-  fn oldest_withheld_change(&self) -> Option<(Timestamp, GUID, SequenceNumber)> {
+  // The changes that a Reliable DataReader cannot yet take, because an earlier sample from
+  // the same Writer is still missing, by Writer and SequenceNumber.
+  fn withheld_changes(&self) -> impl Iterator<Item = (GUID, SequenceNumber, Timestamp)> + '_ {
     self
       .received_reliably_before
       .iter()
-      .filter_map(|(writer, marker)| {
-        self
-          .sequence_numbers
-          .get(writer)?
-          .range(marker..)
-          .next()
-          .map(|(sn, ts)| (*ts, *writer, *sn))
-      })
-      .min()
+      .filter_map(|(writer, marker)| Some((writer, self.sequence_numbers.get(writer)?.range(marker..))))
+      .flat_map(|(writer, withheld)| withheld.map(|(sn, instant)| (*writer, *sn, *instant)))
   }
 
-  // The oldest samples that exceed the limits.
-  fn excess_samples(&self) -> usize {
-    let count = self.changes.len();
+  // Whether the change is kept however many there are: no DataReader could read it yet.
+  fn is_retained(&self, change: &CacheChange) -> bool {
+    let (writer, sn) = (&change.writer_guid, change.sequence_number);
+    let marker = self.received_reliably_before.get(writer);
+    let unread = self.unread.get(writer);
+    marker.is_some_and(|marker| sn >= *marker)
+      || unread.is_some_and(|(from, until)| (*from..*until).contains(&sn))
+  }
+
+  // The oldest samples that exceed the limits, of those that are not retained, or of all if
+  // `retained` is 0.
+  fn excess_samples(&self, retained: usize) -> usize {
+    let count = self.changes.len().saturating_sub(retained);
     let by_count = count.saturating_sub(self.max_keep_samples as usize);
     let Some(max_keep_bytes) = self.max_keep_bytes else {
       return by_count;
     };
     let mut bytes = 0;
-    let kept = self.changes.values().rev().take_while(|change| {
-      bytes += change.data_value.own_bytes();
-      bytes <= max_keep_bytes
-    });
+    let changes = self.changes.values().rev();
+    let kept = changes
+      .filter(|change| retained == 0 || !self.is_retained(change))
+      .take_while(|change| {
+        bytes += change.data_value.own_bytes();
+        bytes <= max_keep_bytes
+      });
     max(by_count, count - kept.count())
   }
 
-  // Payload bytes retained from the oldest withheld change onwards.
-  fn withheld_bytes(&self, from: Timestamp) -> usize {
-    self
-      .changes
-      .range(from..)
-      .map(|(_, cc)| cc.data_value.payload_size())
+  fn withheld_bytes(&self) -> usize {
+    self.bytes_of(self.withheld_changes().map(|(.., instant)| instant))
+  }
+
+  fn unread_changes(&self) -> impl Iterator<Item = Timestamp> + '_ {
+    let instants = self.unread.iter().filter_map(|(writer, (from, until))| {
+      let numbers = self.sequence_numbers.get(writer)?;
+      Some(numbers.range(*from..*until).map(|(_, instant)| *instant))
+    });
+    instants.flatten()
+  }
+
+  fn bytes_of(&self, instants: impl Iterator<Item = Timestamp>) -> usize {
+    instants
+      .filter_map(|instant| self.get_change(&instant))
+      .map(|change| change.data_value.payload_size())
       .sum()
   }
 
@@ -375,14 +427,18 @@ impl TopicCache {
   // and hand over the samples after them. Returns true if anything was given up.
   fn give_up_withheld_over_limit(&mut self) -> bool {
     // Under the limits nothing is retained just for being withheld.
-    if self.excess_samples() == 0 {
+    if self.excess_samples(0) == 0 {
       return false;
     }
+    if self.bytes_of(self.unread_changes()) > MAX_WITHHELD_BYTES_PER_TOPIC {
+      self.unread.clear();
+    }
     let mut gave_up = false;
-    while let Some((oldest, writer, first_present)) = self.oldest_withheld_change() {
-      if self.withheld_bytes(oldest) <= MAX_WITHHELD_BYTES_PER_TOPIC {
-        break;
-      }
+    while self.withheld_bytes() > MAX_WITHHELD_BYTES_PER_TOPIC {
+      let oldest = self.withheld_changes().min_by_key(|(.., instant)| *instant);
+      let Some((writer, ..)) = oldest else { break };
+      let first_present = self.withheld_changes().find(|(of, ..)| *of == writer);
+      let Some((_, first_present, _)) = first_present else { break };
       debug!(
         "Topic {:?}: giving up on samples from {:?} missing before {:?}",
         self.topic_name, writer, first_present
@@ -607,10 +663,11 @@ impl TopicCache {
     // distinguish between instances, so cannot observe max instance counts.
     // We have to do just with min/max sample counts.
 
-    let sample_count = self.changes.len();
+    let retained = self.withheld_changes().count() + self.unread_changes().count();
+    let sample_count = self.changes.len().saturating_sub(retained);
 
     // We must remove at least enough to stay within max limit,
-    let must_remove_count = self.excess_samples();
+    let must_remove_count = self.excess_samples(retained);
 
     let may_remove_count = match self.min_keep_samples {
       // We are erquested to KeepAll, so do not remove more than absolutely required.
@@ -630,37 +687,23 @@ impl TopicCache {
     // sample. Samples released by giving up are not evicted in the same pass, so
     // the Reader gets a chance to take them.
     if !self.give_up_withheld_over_limit() {
-      let oldest_withheld = self.oldest_withheld_change().map(|(ts, _, _)| ts);
-
-      let oldest_timestamp_to_retain_opt: Option<Timestamp> = self
-        .changes
-        .keys()
-        .enumerate()
-        .skip_while(|(i, ts)|
-          // Skip samples to be removed. Force "must" count, and then remove until
-          // either limit timestamp or "may" count stops us
-          oldest_withheld.is_none_or(|w| **ts < w)
-          && (*i < must_remove_count
-          || (**ts < remove_before && *i < may_remove_count)))
-        .map(|(_, ts)| ts) // un-enumerate
-        .next() // the next element would be the first to retain
-        .copied();
-
-      // In case `.next()` is `None`, then we just decided to to discard everything,
-      // or, as a special case, the cache was empty to begin with, but the end
-      // result is the same.
-
-      let to_retain = if let Some(split_key) = oldest_timestamp_to_retain_opt {
-        // split_off: Returns everything after the given key, including the key.
-        self.changes.split_off(&split_key)
-      } else {
-        BTreeMap::new()
-      };
-
-      let to_remove = std::mem::replace(&mut self.changes, to_retain);
-
-      // update also SequenceNumber map
-      to_remove.values().for_each(|r| self.remove_sn(r));
+      // Any of the changes may be retained: a repair is received after younger samples.
+      let mut removed = Vec::new();
+      for (instant, change) in &self.changes {
+        let must_remove = removed.len() < must_remove_count;
+        let may_remove = *instant < remove_before && removed.len() < may_remove_count;
+        if !must_remove && !may_remove {
+          break;
+        }
+        if !self.is_retained(change) {
+          removed.push(*instant);
+        }
+      }
+      for instant in removed {
+        if let Some(change) = self.changes.remove(&instant) {
+          self.remove_sn(&change);
+        }
+      }
     }
 
     // Now, reallocate old cache changes
@@ -966,6 +1009,84 @@ mod tests {
     topic_cache.remove_changes_before(Timestamp::ZERO);
     assert_eq!(topic_cache.changes.len(), 90);
     assert_eq!(topic_cache.reliable_before(writer), SequenceNumber::new(1));
+  }
+
+  // The Writer sends the last sample first, and then repairs the others but for the first.
+  #[test]
+  fn a_withheld_sample_is_kept_while_older_ones_are_repaired() {
+    let mut topic_cache = keep_all_topic_cache();
+    let writer = user_writer();
+    let last = 2 * i64::from(topic_cache.max_keep_samples);
+    add_after_missing_first(&mut topic_cache, writer, last, 100);
+    for sn in 2..last {
+      add_after_missing_first(&mut topic_cache, writer, sn, 100);
+      topic_cache.remove_changes_before(Timestamp::ZERO);
+    }
+    add_after_missing_first(&mut topic_cache, writer, 1, 100);
+    let numbers: Vec<i64> = topic_cache
+      .get_changes_in_range_reliable(&BTreeMap::new())
+      .map(|(_, change)| i64::from(change.sequence_number))
+      .collect();
+    assert_eq!(numbers, (1..=last).collect::<Vec<_>>());
+  }
+
+  // Twice as many samples as are kept otherwise become available with the first one.
+  #[test]
+  fn samples_that_become_available_at_once_are_kept_until_they_are_read() {
+    let mut topic_cache = keep_all_topic_cache();
+    let writer = user_writer();
+    let max_keep = i64::from(topic_cache.max_keep_samples);
+    let last = 2 * max_keep;
+    for sn in (2..=last).chain([1]) {
+      add_after_missing_first(&mut topic_cache, writer, sn, 100);
+    }
+    for sn in last + 1..=last + 10 {
+      add_after_missing_first(&mut topic_cache, writer, sn, 100);
+      topic_cache.remove_changes_before(Timestamp::ZERO);
+    }
+    let count_unread = |topic_cache: &TopicCache, read: i64| {
+      let read = BTreeMap::from([(writer, SequenceNumber::new(read))]);
+      topic_cache.get_changes_in_range_reliable(&read).count() as i64
+    };
+    assert_eq!(count_unread(&topic_cache, 0), last + 10);
+    topic_cache.set_read(writer, SequenceNumber::new(max_keep));
+    topic_cache.remove_changes_before(Timestamp::ZERO);
+    assert_eq!(count_unread(&topic_cache, 0), last);
+    assert_eq!(count_unread(&topic_cache, max_keep), max_keep + 10);
+    topic_cache.set_read(writer, SequenceNumber::new(last));
+    topic_cache.remove_changes_before(Timestamp::ZERO);
+    assert_eq!(count_unread(&topic_cache, 0), max_keep);
+    assert!(topic_cache.unread.is_empty());
+  }
+
+  // An application that reads nothing.
+  #[test]
+  fn large_unread_samples_are_kept_by_their_number_only() {
+    let mut topic_cache = keep_all_topic_cache();
+    let writer = user_writer();
+    let size = crate::rtps::constant::MAX_WITHHELD_BYTES_PER_TOPIC / 100;
+    for sn in (2..=100).chain([1]).chain(101..=120) {
+      add_after_missing_first(&mut topic_cache, writer, sn, size);
+      topic_cache.remove_changes_before(Timestamp::ZERO);
+    }
+    assert!(topic_cache.changes.len() <= topic_cache.max_keep_samples as usize);
+  }
+
+  // As many withheld samples as are kept otherwise, of a Writer whose first sample is missing.
+  #[test]
+  fn withheld_samples_do_not_keep_those_of_other_writers() {
+    let mut topic_cache = keep_all_topic_cache();
+    let max_keep = topic_cache.max_keep_samples as usize;
+    for sn in 2..max_keep as i64 + 2 {
+      add_after_missing_first(&mut topic_cache, user_writer(), sn, 100);
+    }
+    let other = GUID::dummy_test_guid(EntityKind::WRITER_WITH_KEY_USER_DEFINED);
+    for sn in 1..=100 {
+      add_after_missing_first(&mut topic_cache, other, sn, 100);
+      topic_cache.remove_changes_before(Timestamp::ZERO);
+    }
+    assert_eq!(topic_cache.changes.len(), 2 * max_keep);
+    assert_eq!(topic_cache.withheld_changes().count(), max_keep);
   }
 
   #[test]

@@ -459,7 +459,7 @@ where
       Some(policy::Reliability::Reliable { .. })
     );
 
-    let topic_cache = self.acquire_the_topic_cache_guard();
+    let mut topic_cache = self.acquire_the_topic_cache_guard();
 
     let mut read_state_ref = self.read_state.lock().unwrap();
     let latest_instant = read_state_ref.latest_instant;
@@ -509,6 +509,7 @@ where
         read_state_ref.latest_instant = max(latest_instant, timestamp);
         if is_reliable {
           read_state_ref.set_last_read_sn(writer_guid, sequence_number, &topic_cache);
+          topic_cache.set_read(writer_guid, sequence_number);
         }
 
         // // Debug sanity check:
