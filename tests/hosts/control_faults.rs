@@ -69,7 +69,8 @@ fn up(bridge: &Bridge, host: &Host) -> Process {
     up
 }
 
-fn wait_running(bridge: &Bridge) {
+/// Waits until ingress, control and the two default lanes run.
+pub fn wait_running(bridge: &Bridge) {
     bridge.wait_status("all processes", |status| {
         let processes = status["processes"].as_array().unwrap();
         processes.len() == 4 && processes.iter().all(|process| process["state"] == "running")

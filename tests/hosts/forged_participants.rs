@@ -8,15 +8,20 @@ use std::time::{Duration, Instant};
 
 use adaptive_bridge::config;
 use adaptive_bridge::process::MemoryNeeds;
-use support::bed::{Bed, CRITICAL, INPUT, SCAN, SCAN_TYPE};
+use nix::sys::signal::Signal;
+use support::bed::{Bed, CRITICAL, INPUT, SCAN, SCAN_TYPE, STANDBYS};
 use support::bridge::refused;
 use support::peer::{Peer, Received, Sent};
-use support::process::memory_kib;
+use support::process::{memory_kib, signal};
 use support::rtps::{LEASE_S, Message, Prefix};
+
+use super::control_faults::wait_running;
+use super::standby::{took_ms, wait_standby, wait_take_over};
 
 const PARTICIPANTS: u32 = 1_000_000;
 const ATTACK: Duration = Duration::from_secs(60);
-const ROLES: [&str; 4] = ["ingress", "control", "egress-critical", "egress-noncritical"];
+const LANE: &str = "egress-critical";
+const ROLES: [&str; 4] = ["ingress", "control", LANE, "egress-noncritical"];
 /// How much the resident memory of each process may grow.
 const MAX_GROWTH_KIB: i64 = 32 * 1024;
 /// The most participants that a process evicts: it admits 128 at once and 32 a second from one address.
@@ -112,6 +117,44 @@ fn each_process_counts_the_readers_of_a_participant_beyond_its_limit() {
     critical.end::<Received>().assert_all_of(&sent);
     late.end::<Received>().assert_sound();
     bed.wait_accounted();
+    bed.end();
+}
+
+// A standby that read all of them took 56 to 154 ms, and discovery reported more of them than can wait.
+#[test]
+fn a_standby_takes_over_with_the_subscribers_and_few_of_many_forged_participants() {
+    let test = "a_standby_takes_over_with_the_subscribers_and_few_of_many_forged_participants";
+    let _alone = support::exclusive();
+    let Some(bed) = Bed::start(test, &format!("{SCAN}{STANDBYS}")) else { return };
+    wait_running(&bed.bridge);
+    let (socket, processes, stop) =
+        (bed.host("slow").udp_socket(), bed.discovery_addresses(), Arc::new(AtomicBool::new(false)));
+    let attack = std::thread::spawn({
+        let stop = Arc::clone(&stop);
+        move || announce(&socket, &processes, 16, |_| !stop.load(Ordering::Relaxed))
+    });
+    support::wait_until("ingress and the lane to be full of forged participants", || {
+        let status = bed.bridge.status();
+        ["ingress", LANE].iter().all(|role| refused(&status, role, "evicted_participant") > 0)
+    });
+    // Younger than the forged ones.
+    let critical = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
+    let publisher = bed.publish(Peer::fast().keep_all().rate_hz(200.0), INPUT);
+    critical.wait_received(200);
+    for (name, take_overs) in [(LANE, 1), ("ingress", 1), (LANE, 2), ("ingress", 2)] {
+        signal(wait_standby(&bed, name), Signal::SIGKILL);
+        let took_ms = took_ms(&wait_take_over(&bed, name, take_overs));
+        println!("{name}: taken over in {took_ms:.1} ms");
+        critical.wait_received(critical.received() + 200);
+    }
+    stop.store(true, Ordering::Relaxed);
+    attack.join().unwrap();
+    let sent: Sent = publisher.end();
+    critical.wait_received(sent.ok);
+    critical.end::<Received>().assert_all_of(&sent);
+    bed.wait_accounted();
+    let log = bed.up.log();
+    assert!(!log.contains("more changes at a time than can wait"), "{log}");
     bed.end();
 }
 

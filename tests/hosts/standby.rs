@@ -68,6 +68,19 @@ pub fn wait_standby(bed: &Bed, name: &str) -> i32 {
     i32::try_from(number(&process(&status, name)["pid"])).unwrap()
 }
 
+/// Waits until standbys of the role have taken over that often, and returns what the status shows of them.
+pub fn wait_take_over(bed: &Bed, name: &str, take_overs: u64) -> Value {
+    let status = bed.bridge.wait_status(&format!("take-over {take_overs} of {name}"), |status| {
+        process(status, name)["standby"]["take_overs"] == take_overs
+    });
+    process(&status, name)["standby"].clone()
+}
+
+/// How long the last take-over took.
+pub fn took_ms(standby: &Value) -> f64 {
+    number(&standby["took_ns"]) as f64 / 1e6
+}
+
 /// The pauses between two samples from the one with that index on, in ms.
 fn pauses_ms(subscriber: &RunningPeer, first: usize) -> Vec<f64> {
     let events = subscriber.events().into_iter().filter(|event| event["event"] == "sample").skip(first);
@@ -144,14 +157,10 @@ fn take_over(test: &str, events: &[(&str, Event)], publisher: Peer) {
         if event.cause() == "stopped" {
             stopped.push(active);
         }
-        let take_overs = index as u64 / 2 + 1;
-        let status = bed.bridge.wait_status(&format!("take-over {take_overs} of {name}"), |status| {
-            process(status, name)["standby"]["take_overs"] == take_overs
-        });
+        let standby = wait_take_over(&bed, name, index as u64 / 2 + 1);
         all_receive(100);
-        let standby = process(&status, name)["standby"].clone();
         assert_eq!(standby["cause"], event.cause(), "{name}, {event:?}: {standby}");
-        let took_ms = number(&standby["took_ns"]) as f64 / 1e6;
+        let took_ms = took_ms(&standby);
         let pause_ms = pauses_ms(watched, before.saturating_sub(10)).into_iter().fold(0.0, f64::max);
         println!("{name}, {event:?}: taken over in {took_ms:.1} ms, longest pause {pause_ms:.1} ms");
     }

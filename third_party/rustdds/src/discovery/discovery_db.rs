@@ -266,7 +266,8 @@ impl DiscoveryDB {
     })
   }
 
-  fn has_endpoint_with_local_topic(&self, prefix: GuidPrefix) -> bool {
+  /// Whether that participant has a reader or writer of a topic of ours.
+  pub fn has_endpoint_with_local_topic(&self, prefix: GuidPrefix) -> bool {
     let mut readers = self.external_topic_readers.range(prefix.range());
     let mut writers = self.external_topic_writers.range(prefix.range());
     readers.any(|(_, reader)| self.is_local_topic(reader.subscription_topic_data.topic_name()))
@@ -434,6 +435,12 @@ impl DiscoveryDB {
       .filter(|(_, data)| condition(data))
       .map(|(prefix, _)| *prefix)
       .collect()
+  }
+
+  /// The participants, the one that was discovered first at the front.
+  pub fn participants_by_age(&self) -> impl Iterator<Item = (GuidPrefix, &SpdpDiscoveredParticipantData)> {
+    let prefixes = self.discovery_order.iter();
+    prefixes.filter_map(|prefix| Some((*prefix, self.participant_proxies.get(prefix)?)))
   }
 
   pub fn remove_topic_reader(&mut self, guid: GUID) {

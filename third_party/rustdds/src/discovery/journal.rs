@@ -19,6 +19,10 @@ use crate::{
 /// A longer journal is not read.
 pub(crate) const MAX_JOURNAL_BYTES: usize = 256 << 10;
 
+/// The most participants in a journal that have no endpoint with a topic of ours. With 1,024 forged ones, as many as
+/// a database has, a take-over took up to 154 ms. One that is left out is discovered by its next announcement.
+const MAX_OTHERS: usize = 128;
+
 pub(crate) const ENCODING: RepresentationIdentifier = RepresentationIdentifier::PL_CDR_LE;
 // The kinds of records. A record is its kind, the length of the announcement, and the
 // announcement as it goes over the network, without an encapsulation header.
@@ -35,18 +39,25 @@ pub(crate) enum Known {
 }
 
 /// The participants in the database but `own`, each followed by its readers and writers of topics of ours.
+///
+/// Those that have such an endpoint are first, the ones discovered first at the front. A participant for which
+/// there is no room is left out.
 pub(crate) fn write(db: &DiscoveryDB, own: GuidPrefix) -> Vec<u8> {
+  let participants = db.participants_by_age().filter(|(prefix, _)| *prefix != own);
+  let (with_our_topics, others): (Vec<_>, Vec<_>) =
+    participants.partition(|(prefix, _)| db.has_endpoint_with_local_topic(*prefix));
   let mut journal = Vec::new();
-  for prefix in db.participant_prefixes(|data| data.participant_guid.prefix != own) {
-    let Some(participant) = db.find_participant_proxy(prefix) else {
-      continue;
-    };
+  for (prefix, participant) in with_our_topics.into_iter().chain(others.into_iter().take(MAX_OTHERS)) {
+    let end = journal.len();
     append(&mut journal, PARTICIPANT, participant);
     for reader in db.readers_of_local_topics(prefix) {
       append(&mut journal, READER, reader);
     }
     for writer in db.writers_of_local_topics(prefix) {
       append(&mut journal, WRITER, writer);
+    }
+    if journal.len() > MAX_JOURNAL_BYTES {
+      journal.truncate(end);
     }
   }
   journal
@@ -142,6 +153,49 @@ mod tests {
     db.update_publication(&new_writer(participant, 5, "another"));
     let guids = (reader.reader_proxy.remote_reader_guid, writer.writer_proxy.remote_writer_guid);
     (write(&db, own.prefix), guids.0, guids.1)
+  }
+
+  // The participants in the journal of a database in which those with that many writers of a topic of ours were
+  // discovered, and those.
+  fn written(writers: &[u32]) -> (Vec<GuidPrefix>, Vec<GuidPrefix>) {
+    let (updated_sender, _updated_receiver) = std::sync::mpsc::sync_channel::<()>(4);
+    let (status_sender, _status_receiver) = sync_status_channel(16).unwrap();
+    let own = GUID::new_participant_guid();
+    let mut db = DiscoveryDB::new(own, updated_sender, status_sender);
+    db.update_local_topic_reader(new_reader(own, 1, "ours"));
+    let mut discovered = Vec::new();
+    for writers in writers {
+      let data = new_participant();
+      db.update_participant(&data);
+      for key in 0..*writers {
+        db.update_publication(&new_writer(data.participant_guid, key, "ours"));
+      }
+      discovered.push(data.participant_guid.prefix);
+    }
+    let known = read(&write(&db, own.prefix), own.prefix).expect("longer than what is read");
+    let in_journal = known.iter().filter_map(|known| match known {
+      Known::Participant(data) => Some(data.participant_guid.prefix),
+      _ => None,
+    });
+    (in_journal.collect(), discovered)
+  }
+
+  #[test]
+  fn a_journal_has_those_with_a_topic_of_ours_first_and_a_limited_number_of_others() {
+    let others = MAX_OTHERS + 10;
+    let mut writers = vec![0; others];
+    writers.extend([1; 20]);
+    let (in_journal, discovered) = written(&writers);
+    let expected = [&discovered[others..], &discovered[..MAX_OTHERS]].concat();
+    assert_eq!(in_journal, expected);
+  }
+
+  // A journal that is too long would not be read at all.
+  #[test]
+  fn a_journal_has_as_many_as_it_has_room_for() {
+    let (in_journal, discovered) = written(&[250; 20]);
+    assert!((1..20).contains(&in_journal.len()), "{} participants", in_journal.len());
+    assert_eq!(in_journal, discovered[..in_journal.len()]);
   }
 
   fn other() -> GuidPrefix {
