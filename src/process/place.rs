@@ -89,8 +89,10 @@ impl Place {
         };
         let Some(place) = place else { return Ok(None) };
         let mut waiting = Waiting::open(settings, place, role, &boards)?;
-        let in_force = &reloads.in_force.settings;
-        let mut prepare = || prepare(&node, in_force);
+        let mut prepare = || {
+            reloads.discard_requests();
+            prepare(&node, &reloads.in_force.settings);
+        };
         let Some(lock) = waiting.wait(settings, name, stop, &mut prepare)? else { return Ok(None) };
         reloads.refresh();
         Ok(Some(Self { lock, node, boards, reloads, take_over: Some(waiting.take_over()) }))

@@ -136,10 +136,9 @@ pub(super) struct WaitingReloads {
     pub in_force: Configuration,
     share: Option<InForceShare>,
     parameters: Option<ParameterStore>,
+    request: Request,
     outcomes: Receiver<Outcome>,
-    begin: SyncSender<(Reloader, PathBuf, bool)>,
-    /// Whether requests that have come so far were for another process.
-    is_refreshed: bool,
+    begin: SyncSender<(Request, Reloader, PathBuf)>,
 }
 
 impl WaitingReloads {
@@ -153,26 +152,27 @@ impl WaitingReloads {
         let parameters = file.map(|file| ParameterStore::new(Arc::clone(&request.load), file));
         // Of capacity 0: the thread writes the note only after housekeeping has taken the outcome.
         let (sender, outcomes) = sync_channel(0);
-        let (begin, begun) = sync_channel::<(Reloader, PathBuf, bool)>(1);
+        let (begin, begun) = sync_channel::<(Request, Reloader, PathBuf)>(1);
         let thread = std::thread::Builder::new().name("reload".to_owned());
         #[allow(clippy::disallowed_methods, reason = "this thread handles no samples")]
         thread.spawn(move || {
             // An error is the end of a process that got no role.
-            if let Ok((reloader, note, is_refreshed)) = begun.recv() {
-                let mut request = request;
-                if is_refreshed {
-                    request.signals.pending().for_each(drop);
-                }
+            if let Ok((request, reloader, note)) = begun.recv() {
                 serve(request, reloader, &sender, &note);
             }
         })?;
-        Ok(Self { in_force, share, parameters, outcomes, begin, is_refreshed: false })
+        Ok(Self { in_force, share, parameters, request, outcomes, begin })
     }
 
-    /// Reads what the other processes have put in force since this one was started. The requests that came
-    /// meanwhile were for the process that it waited for: the file may have been edited since.
+    /// Discards the requests that have come so far: they were for the process that this one waits for, and
+    /// the file may have been edited since. To be called periodically: those since the last call are handled
+    /// after [`begin`](Self::begin), as the former process may have ended before it handled them.
+    pub fn discard_requests(&mut self) {
+        self.request.signals.pending().for_each(drop);
+    }
+
+    /// Reads what the other processes have put in force since this one was started.
     pub fn refresh(&mut self) {
-        self.is_refreshed = true;
         let Some(share) = &self.share else { return };
         let stored = share.file().read().ok().flatten();
         if let Some(stored) = stored.and_then(|bytes| Configuration::decode(&bytes).ok()) {
@@ -185,7 +185,7 @@ impl WaitingReloads {
         let file = self.share.as_ref().map(InForceShare::file);
         // The thread waits for this message.
         let reloader = Reloader { current: self.in_force.clone(), file };
-        let _ = self.begin.send((reloader, note, self.is_refreshed));
+        let _ = self.begin.send((self.request, reloader, note));
         Reloads {
             in_force: self.in_force,
             refused: 0,
@@ -435,5 +435,48 @@ pub fn reload_all(root: &Path, instance: &InstanceName) -> Result<Vec<ReloadAnsw
         }
         #[allow(clippy::disallowed_methods, reason = "a reload is asked for outside the data path")]
         std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicUsize;
+
+    use super::super::test_role::{SCAN, wait_until};
+    use super::*;
+    use crate::config;
+
+    #[test]
+    fn a_take_over_handles_the_requests_since_the_last_ones_that_were_discarded() {
+        let settings = config::parse(SCAN, "f.yaml", &|_| None).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        // A process that waits, and how often it has read the file.
+        let waiting = || {
+            let (read, reads) = (settings.clone(), Arc::new(AtomicUsize::new(0)));
+            let count = Arc::clone(&reads);
+            let requests = ReloadRequests::on_signal(move |_| {
+                count.fetch_add(1, Ordering::Relaxed);
+                Ok(read.clone().into())
+            });
+            (WaitingReloads::start(requests.unwrap(), &settings).unwrap(), reads)
+        };
+        let begin = |mut waiting: WaitingReloads| {
+            waiting.refresh();
+            waiting.begin(folder.path().join("note"))
+        };
+
+        let (mut process, reads) = waiting();
+        raise(Signal::SIGHUP).unwrap();
+        process.discard_requests();
+        let mut reloads = begin(process);
+        std::thread::sleep(Duration::from_millis(200));
+        assert_eq!((reads.load(Ordering::Relaxed), reloads.poll()), (0, None));
+
+        let (mut process, reads) = waiting();
+        process.discard_requests();
+        raise(Signal::SIGHUP).unwrap();
+        let mut reloads = begin(process);
+        wait_until("the request is handled", || reloads.poll() == Some(true));
+        assert_eq!(reads.load(Ordering::Relaxed), 1);
     }
 }
