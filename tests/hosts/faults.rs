@@ -9,6 +9,7 @@ use nix::unistd::Pid;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, NO_STANDBYS, NONCRITICAL, SCAN, outputs};
 use support::bridge::{Bridge, program};
+use support::flow::lane;
 use support::netns::Net;
 use support::peer::{Peer, Received, RunningPeer, Sent};
 use support::process::{Process, signal};
@@ -57,10 +58,6 @@ impl Flow {
         sent.assert_not_blocked();
         (sent, received)
     }
-}
-
-fn lane<'a>(status: &'a Value, name: &str) -> &'a Value {
-    outputs(status).find(|output| output["lane"] == name).unwrap_or_else(|| panic!("{name} in {status}"))
 }
 
 /// The names of an instance's files in `/dev/shm`.

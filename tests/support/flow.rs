@@ -157,5 +157,5 @@ fn wait_accounted(bridge: &Bridge, sent: u32) -> Value {
 /// The output of a lane of the first route in a status.
 pub fn lane<'a>(status: &'a Value, name: &str) -> &'a Value {
     let lanes = status["routes"][0]["lanes"].as_array().unwrap();
-    lanes.iter().find(|lane| lane["lane"] == name).unwrap()
+    lanes.iter().find(|lane| lane["lane"] == name).unwrap_or_else(|| panic!("{name} in {status}"))
 }
