@@ -3,6 +3,7 @@
 
 #![cfg(all(target_os = "linux", target_arch = "x86_64"))]
 
+use std::collections::BTreeSet;
 use std::os::unix::net::UnixDatagram;
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -12,10 +13,13 @@ use nix::unistd::Pid;
 use serde_json::Value;
 use support::bed::{Bed, CRITICAL, INPUT, SCAN};
 use support::bridge::program;
+use support::cpu_delay::two_cpus;
 use support::netns::{Net, requires_root};
 use support::peer::{Peer, Received, Sent};
 use support::process::Process;
-use support::threads::{Fault, THREADS, cause, thread};
+use support::threads::{Fault, THREADS, cause, others, resume, stop, thread};
+
+const ROLES: [&str; 4] = ["ingress", "egress-critical", "egress-noncritical", "control"];
 
 #[test]
 fn up_restarts_a_process_in_which_any_thread_hangs_or_ends() {
@@ -25,7 +29,7 @@ fn up_restarts_a_process_in_which_any_thread_hangs_or_ends() {
     let publisher = bed.publish(Peer::cyclone().keep_last(1000).rate_hz(100.0), INPUT);
     subscriber.wait_received(100);
     std::thread::scope(|scope| {
-        for role in ["ingress", "egress-critical", "egress-noncritical", "control"] {
+        for role in ROLES {
             let bed = &bed;
             scope.spawn(move || {
                 for fault in [Fault::Hang, Fault::End] {
@@ -52,6 +56,39 @@ fn up_restarts_a_process_in_which_any_thread_hangs_or_ends() {
     subscriber.wait_received(subscriber.received() + 300);
     let _: Sent = publisher.end();
     let _: Received = subscriber.end();
+    bed.end();
+}
+
+#[test]
+fn samples_flow_while_every_other_thread_of_every_process_hangs() {
+    let test = "samples_flow_while_every_other_thread_of_every_process_hangs";
+    let Some([of_ingress, of_lane]) = two_cpus() else {
+        return support::skip(test, "one CPU, so that ingress starts no early waker");
+    };
+    let metrics = "diagnostics: {metrics: '127.0.0.1:9464'}";
+    let pinned = format!(
+        "{SCAN}{metrics}\nprocesses: {{ingress: {{scheduling: {{cpus: [{of_ingress}]}}}}}}\n\
+         lanes: {{critical: {{scheduling: {{cpus: [{of_lane}]}}}}}}\n"
+    );
+    let Some(bed) = Bed::start(test, &pinned) else { return };
+    let subscriber = bed.subscribe("critical", Peer::cyclone().keep_all(), CRITICAL);
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(100.0), INPUT);
+    subscriber.wait_received(100);
+    let of_role = |role: &str| others(bed.pid(role));
+    let threads: Vec<_> = ROLES.into_iter().flat_map(of_role).collect();
+    let names: BTreeSet<&str> = threads.iter().map(|(_, name)| name.as_str()).collect();
+    assert_eq!(names, BTreeSet::from(["early-waker", "log", "metrics", "parameters", "reload", "report"]));
+    threads.iter().for_each(|(thread, _)| stop(*thread));
+    // Longer than a process may be without progress.
+    subscriber.wait_received(subscriber.received() + 1_000);
+    threads.iter().for_each(|(thread, _)| resume(*thread));
+    let sent: Sent = publisher.end();
+    subscriber.wait_received(sent.ok);
+    subscriber.end::<Received>().assert_all_of(&sent);
+    bed.wait_accounted();
+    for role in ROLES {
+        assert_eq!(bed.pids(role).len(), 1, "{role} was restarted\n{}", bed.up.log());
+    }
     bed.end();
 }
 

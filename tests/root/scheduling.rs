@@ -10,9 +10,10 @@ use adaptive_bridge::model::{Encapsulation, QosProfile, SourceTimestamp};
 use adaptive_bridge::shm::{BridgeShape, ShmNode, Woken};
 use bytes::Bytes;
 use nix::libc;
-use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
+use nix::sched::{CpuSet, sched_setaffinity};
 use nix::unistd::Pid;
 use support::bridge::Bridge;
+use support::cpu_delay::two_cpus;
 use support::process::Process;
 use support::{exclusive, netns, skip, wait_for};
 
@@ -109,13 +110,6 @@ fn early_waker(ingress: &Process) -> Option<(u32, String)> {
         let cpus = status.lines().find_map(|line| line.strip_prefix("Cpus_allowed_list:"))?;
         Some((policy, cpus.trim().to_owned()))
     })
-}
-
-/// Two CPUs that this process may run on.
-fn two_cpus() -> Option<[usize; 2]> {
-    let allowed = sched_getaffinity(Pid::from_raw(0)).unwrap();
-    let mut cpus = (0..CpuSet::count()).filter(|cpu| allowed.is_set(*cpu).unwrap());
-    Some([cpus.next()?, cpus.next()?])
 }
 
 /// Ingress of a bridge with one critical lane, with the scheduling settings of each.

@@ -12,6 +12,13 @@ use nix::libc;
 use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
 use nix::unistd::Pid;
 
+/// Two CPUs that this process may run on.
+pub fn two_cpus() -> Option<[usize; 2]> {
+    let allowed = sched_getaffinity(Pid::from_raw(0)).unwrap();
+    let mut cpus = (0..CpuSet::count()).filter(|cpu| allowed.is_set(*cpu).unwrap());
+    Some([cpus.next()?, cpus.next()?])
+}
+
 /// How long the thread of each CPU sleeps. A shorter period would keep the CPU from its deeper idle states.
 const PERIOD: Duration = Duration::from_millis(2);
 

@@ -48,8 +48,23 @@ fn wait_end(process: i32, thread: Pid) {
     }
 }
 
+/// The ids and names of the threads of the process that are not among [`THREADS`].
+pub fn others(process: i32) -> Vec<(Pid, String)> {
+    let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap().flatten();
+    let named = tasks.filter_map(|task| {
+        let name = std::fs::read_to_string(task.path().join("comm")).ok()?;
+        Some((Pid::from_raw(task.file_name().to_string_lossy().parse().ok()?), name.trim_end().to_owned()))
+    });
+    named.filter(|(id, name)| id.as_raw() != process && !THREADS.contains(&Some(name.as_str()))).collect()
+}
+
+/// Lets a thread go on that [`stop`] has stopped.
+pub fn resume(thread: Pid) {
+    ptrace::detach(thread, None).unwrap();
+}
+
 /// Stops the thread. The calling thread traces it from then on.
-fn stop(thread: Pid) {
+pub fn stop(thread: Pid) {
     ptrace::seize(thread, ptrace::Options::empty()).unwrap();
     ptrace::interrupt(thread).unwrap();
     assert!(matches!(wait(thread), WaitStatus::PtraceEvent(..) | WaitStatus::Stopped(..)));
