@@ -22,6 +22,11 @@ struct Seen {
 
 /// Kills the critical lane under four subscribers, after each `pause`.
 fn kill(bed: &Bed, rate_hz: f64, pause: Duration) -> Vec<Seen> {
+    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(rate_hz).hold(), INPUT);
+    // A route by pattern has its topic by then.
+    bed.bridge.wait_status("the output", |status| {
+        outputs(status).any(|output| output["topic"].as_str().is_some_and(|topic| CRITICAL.ends_with(topic)))
+    });
     let subscribers = [
         ("Fast DDS, RELIABLE", Peer::fast().keep_all()),
         ("Fast DDS, BEST_EFFORT", Peer::fast().keep_all().best_effort()),
@@ -29,7 +34,7 @@ fn kill(bed: &Bed, rate_hz: f64, pause: Duration) -> Vec<Seen> {
         ("Cyclone DDS, BEST_EFFORT", Peer::cyclone().keep_all().best_effort()),
     ]
     .map(|(name, peer)| (name, bed.subscribe("critical", peer, CRITICAL)));
-    let publisher = bed.publish(Peer::cyclone().keep_all().rate_hz(rate_hz), INPUT);
+    publisher.go();
     let all_receive = |more: u64| {
         let before = subscribers.each_ref().map(|(_, subscriber)| subscriber.received());
         for ((_, subscriber), before) in subscribers.iter().zip(before) {
@@ -60,6 +65,18 @@ fn kill(bed: &Bed, rate_hz: f64, pause: Duration) -> Vec<Seen> {
     seen.into()
 }
 
+/// Asserts that no subscriber matched another writer, and that the RELIABLE ones miss no sample. The next
+/// process sends the sample that was numbered and not sent when the lane was killed before it has matched its
+/// subscribers: only RELIABLE ones request it.
+fn assert_unnoticed(subscribers: Vec<Seen>) {
+    for Seen { name, matches, received } in subscribers {
+        assert_eq!(matches, (1, 0), "{name}");
+        received.assert_sound();
+        let most = if name.ends_with("BEST_EFFORT") { KILLS as u64 } else { 0 };
+        assert!(received.missing_count <= most, "{name}: {received:?}");
+    }
+}
+
 #[test]
 fn subscribers_stay_matched_with_a_critical_lane_that_is_killed() {
     let test = "subscribers_stay_matched_with_a_critical_lane_that_is_killed";
@@ -71,14 +88,19 @@ fn subscribers_stay_matched_with_a_critical_lane_that_is_killed() {
     let log = bed.up.log();
     let continued = log.lines().filter(|line| line.contains("identity") && line.contains("continued=true"));
     assert_eq!(continued.count(), KILLS, "{log}");
-    for Seen { name, matches, received } in subscribers {
-        assert_eq!(matches, (1, 0), "{name}");
-        received.assert_sound();
-        // The next process sends the sample that was numbered and not sent when the lane was killed before it
-        // has matched its subscribers. RELIABLE ones request it.
-        let most = if name.ends_with("BEST_EFFORT") { KILLS as u64 } else { 0 };
-        assert!(received.missing_count <= most, "{name}: {received:?}");
-    }
+    assert_unnoticed(subscribers);
+    bed.end();
+}
+
+/// The next process finds the topic of a place in shared memory.
+#[test]
+fn subscribers_stay_matched_with_an_output_whose_topic_matches_a_pattern() {
+    let test = "subscribers_stay_matched_with_an_output_whose_topic_matches_a_pattern";
+    let _alone = support::exclusive();
+    let yaml =
+        "topics: [{id: any, input_topic: /*, exclude: [/rosout], max_routes: 2, max_sample_bytes: 65536}]";
+    let Some(bed) = Bed::start(test, yaml) else { return };
+    assert_unnoticed(kill(&bed, RATE_HZ, Duration::from_millis(1_500)));
     bed.end();
 }
 
@@ -91,12 +113,7 @@ fn subscribers_receive_all_of_a_route_that_allows_large_samples() {
     let yaml = SCAN.replace(", max_sample_bytes: 65536", "");
     assert_ne!(yaml, SCAN);
     let Some(bed) = Bed::start(test, &yaml) else { return };
-    for Seen { name, matches, received } in kill(&bed, 2.0 * RATE_HZ, Duration::from_millis(1_500)) {
-        assert_eq!(matches, (1, 0), "{name}");
-        received.assert_sound();
-        let most = if name.ends_with("BEST_EFFORT") { KILLS as u64 } else { 0 };
-        assert!(received.missing_count <= most, "{name}: {received:?}");
-    }
+    assert_unnoticed(kill(&bed, 2.0 * RATE_HZ, Duration::from_millis(1_500)));
     bed.end();
 }
 

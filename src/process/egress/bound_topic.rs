@@ -16,10 +16,15 @@ pub(super) struct BoundTopic {
 }
 
 impl BoundTopic {
-    pub fn new(route: &Route, output: &config::Output) -> Self {
+    /// The topic of an output at its start. A place has the one that ingress has given to it by now, if any.
+    pub fn new(route: &Route, output: &config::Output, info: &RouteInfo) -> Self {
         let dds_topic = output.topic.resolve(None).map_or_else(String::new, |topic| topic.to_dds());
         let is_place = route.input_topic.is_place();
-        Self { configured: output.topic.clone(), is_place, dds_topic, after: 0, count: 0 }
+        let mut topic = Self { configured: output.topic.clone(), is_place, dds_topic, after: 0, count: 0 };
+        if let Some(bound) = topic.next(info) {
+            topic.set(info, &bound);
+        }
+        topic
     }
 
     /// Whether this is the topic that ingress has given to the place; also true for other routes.
@@ -55,8 +60,9 @@ mod tests {
     fn a_place_changes_its_topic_with_the_record_of_ingress_and_knows_samples_of_the_former_one() {
         let text = "topics: [{id: any, input_topic: /a/**, critical_output: /out/**, max_routes: 1}]";
         let settings = parse(text, "f.yaml", &|_| None).unwrap();
-        let mut topic = BoundTopic::new(&settings.routes[0], &settings.lanes[0].outputs[0]);
+        let start = |info: &_| BoundTopic::new(&settings.routes[0], &settings.lanes[0].outputs[0], info);
         let mut info = RouteInfo::default();
+        let mut topic = start(&info);
         assert!(topic.is_place && topic.is_current(&info) && topic.next(&info).is_none());
         assert_eq!((topic.dds_topic.as_str(), topic.is_former(0)), ("", true));
         // The second topic follows the first one without a sample of it.
@@ -67,16 +73,20 @@ mod tests {
             assert_eq!(next.to_string(), format!("/out{name}"));
             assert!(!topic.is_current(&info));
             topic.set(&info, &next);
-            assert!(topic.is_current(&info) && topic.next(&info).is_none());
-            assert_eq!(topic.dds_topic, format!("rt/out{name}"));
-            assert_eq!([after, after + 1].map(|sequence| topic.is_former(sequence)), [true, false]);
+            // And one that starts now.
+            for topic in [&topic, &start(&info)] {
+                assert!(topic.is_current(&info) && topic.next(&info).is_none());
+                assert_eq!(topic.dds_topic, format!("rt/out{name}"));
+                assert_eq!([after, after + 1].map(|sequence| topic.is_former(sequence)), [true, false]);
+            }
         }
     }
 
     #[test]
     fn another_route_has_its_topic_for_ever() {
         let settings = parse("topics: [{id: scan, input_topic: /scan}]", "f.yaml", &|_| None).unwrap();
-        let topic = BoundTopic::new(&settings.routes[0], &settings.lanes[0].outputs[0]);
+        let output = &settings.lanes[0].outputs[0];
+        let topic = BoundTopic::new(&settings.routes[0], output, &RouteInfo::default());
         assert_eq!(topic.dds_topic, "rt/adaptive_bridge/critical/scan");
         assert!(!topic.is_place && topic.is_current(&RouteInfo::default()) && !topic.is_former(1));
     }

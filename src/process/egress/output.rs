@@ -134,6 +134,7 @@ impl Output {
         let lane = &settings.lanes[lane_index];
         let route = &settings.routes[output.route];
         let boards = role.boards.clone();
+        let info = boards.route_info(output.route).unwrap_or_default();
         let counters = boards.lane_writer(lane_index, output.route);
         let readers = boards.output_readers_writer(lane_index, output.route);
         let record = WriterRecord::of(role, participant, lane_index, output);
@@ -161,7 +162,7 @@ impl Output {
             lane: lane.name.to_string(),
             class: lane.class(),
             route: output.route,
-            topic: BoundTopic::new(route, output),
+            topic: BoundTopic::new(route, output, &info),
             configured: (offer, latched_offer),
             history: offer.history(),
             unsent: UnsentSamples::new(offer.most_unsent()),
@@ -208,11 +209,10 @@ impl Output {
         match &route.message_type {
             // The type of a place is known with its topic.
             Some(message_type) if !opened.topic.is_place => {
-                let known = opened.boards.route_info(output.route).unwrap_or_default();
-                opened.durability.set(known.durability());
+                opened.durability.set(info.durability());
                 opened.follow_durability(participant);
-                let has_keys = known.has_keys != 0;
-                let dds_type = DdsType { name: &message_type.to_dds(), hash: known.type_hash, has_keys };
+                let has_keys = info.has_keys != 0;
+                let dds_type = DdsType { name: &message_type.to_dds(), hash: info.type_hash, has_keys };
                 opened.make_writer(participant, dds_type)?;
             }
             _ => opened.announce_type(participant),

@@ -11,19 +11,18 @@ use crate::model::{DdsType, Durability, EndpointIdentity, Guid, QosProfile};
 use crate::shm::{BoardWriter, ProcessRole, SendLog};
 
 /// Whether the output is such that readers of the former process can be served as if nothing had happened:
-/// without a history, without keys, and not of a topic that ingress chooses.
+/// without a history and without keys.
 fn may_be_continued(role: &Role, output: &Output) -> bool {
     let info = role.boards.route_info(output.route).unwrap_or_default();
     let is_latched = output.latched_qos.is_some() && info.durability() == Durability::TransientLocal;
-    output.qos.durability == Durability::Volatile
-        && !is_latched
-        && info.has_keys == 0
-        && output.topic.resolve(None).is_some()
+    output.qos.durability == Durability::Volatile && !is_latched && info.has_keys == 0
 }
 
 /// The next writer of an output.
 pub(super) struct Next {
     pub continuation: WriterContinuation,
+    /// Whether it is the writer of the former process, with whose readers it is matched already.
+    pub is_former: bool,
     /// The key of the former process' writer if readers still know that one, and this one is another.
     pub superseded: Option<[u8; 3]>,
 }
@@ -107,7 +106,7 @@ impl WriterRecord {
                 log.record(number, sequence);
             }),
         };
-        Next { continuation, superseded }
+        Next { continuation, is_former, superseded }
     }
 
     /// The writer says goodbye.

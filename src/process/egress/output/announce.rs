@@ -143,9 +143,13 @@ impl Output {
             .record
             .as_mut()
             .map(|record| record.next(participant.guid(), &self.topic.dds_topic, &dds_type, &qos));
+        // Of a place, the topic may be another one than that of the former process.
+        if self.topic.is_place && continuation.as_ref().is_none_or(|next| !next.is_former) {
+            self.former_readers = FormerReaders::default();
+        }
         let writer = match continuation {
             None => participant.create_writer(&self.topic.dds_topic, dds_type, &qos, window_samples)?,
-            Some(Next { mut continuation, superseded }) => {
+            Some(Next { mut continuation, superseded, .. }) => {
                 if let Some(key) = superseded {
                     participant.dispose_former_writer(key);
                 }

@@ -10,6 +10,17 @@ fn keep_identity(host: &mut Host) {
     host.role.former.participant = identity.participant;
 }
 
+/// Opens the output of the next process, which collects the samples of the former one.
+fn open_next(host: &mut Host) -> Output {
+    let mut next = host.open();
+    wait_until("the former samples", || {
+        host.publisher.connect_subscribers();
+        next.collect_former(&mut host.participant, &mut host.arena);
+        !next.collects_former()
+    });
+    next
+}
+
 /// The account of processes of a lane that keeps its identity. Each of the first three leaves a sample that
 /// is in the log and not counted; the last one has another writer.
 #[test]
@@ -59,12 +70,7 @@ fn a_killed_process_leaves_its_samples_with_their_numbers() {
     let mut board = OutputReaders::default();
     board.former[0] = Guid([8; 16]);
     host.role.boards.output_readers_writer(CRITICAL, 0).set(board);
-    let mut next = host.open();
-    wait_until("the former samples", || {
-        host.publisher.connect_subscribers();
-        next.collect_former(&mut host.participant, &mut host.arena);
-        !next.collects_former()
-    });
+    let mut next = open_next(&mut host);
     assert!(next.take().is_none() && next.count_sent(), "the former reader has not matched");
     wait_until("the sample that was not counted", || {
         next.writer.as_ref().is_some_and(|writer| writer.sent_through() == 7)
@@ -121,4 +127,37 @@ fn a_process_reads_the_samples_of_the_former_one_before_ingress_delivers_them() 
     second.collect_former(&mut host.participant, &mut host.arena);
     assert!(!second.collects_former());
     assert_eq!((dropped(&second, DropReason::NoReader), dropped(&second, DropReason::LaneDown)), (4, 0));
+}
+
+#[test]
+fn the_writer_of_a_place_is_continued_if_the_place_has_the_same_topic() {
+    let mut host = Host::start(174, CRITICAL, "topics: [{id: any, input_topic: /a/**, max_routes: 1}]");
+    let bind = |host: &Host, topic, after| {
+        host.announce(|info| {
+            (info.bound_topic, info.dds_type) = (FixedText::new(topic), FixedText::new(TYPE));
+            (info.bound_after, info.bound_count) = (after, info.bound_count + 1);
+        });
+    };
+    let writer = |output: &Output| output.writer.as_ref().unwrap().guid();
+    bind(&host, "/a/x", 10);
+    keep_identity(&mut host);
+    let mut first = host.open();
+    let first_writer = writer(&first);
+    host.publish_next(11);
+    host.send(&mut first);
+    drop(first);
+    let mut board = OutputReaders::default();
+    board.former[0] = Guid([8; 16]);
+    host.role.boards.output_readers_writer(CRITICAL, 0).set(board);
+
+    let second = open_next(&mut host);
+    assert_eq!((writer(&second), second.former_readers.missing()), (first_writer, &[Guid([8; 16])][..]));
+    drop(second);
+
+    // Its readers were readers of the former topic.
+    bind(&host, "/a/y", 11);
+    let third = open_next(&mut host);
+    assert_ne!(writer(&third), first_writer);
+    assert!(third.former_readers.is_empty());
+    assert!(third.counters.get().is_accounted_for(), "{:?}", third.counters.get());
 }
