@@ -106,6 +106,8 @@ pub struct FormerSample {
     pub encapsulation: Encapsulation,
     /// Its source timestamp.
     pub timestamp: SourceTimestamp,
+    /// The publisher that sent it, in whose history a writer that is TRANSIENT_LOCAL keeps it.
+    pub publisher: Guid,
 }
 
 impl FormerSample {
@@ -116,6 +118,7 @@ impl FormerSample {
             encoding: encoding(self.encapsulation),
             encoding_options: self.encapsulation.options(),
             source_timestamp: timestamp(self.timestamp),
+            history_source: Some(GUID::from_bytes(self.publisher.0)),
         }
     }
 }

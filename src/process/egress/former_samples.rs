@@ -77,7 +77,8 @@ impl FormerSamples {
         }
         let payload = payload(sample);
         let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
-        let sample = FormerSample { number, payload, encapsulation, timestamp };
+        let publisher = header.writer_guid;
+        let sample = FormerSample { number, payload, encapsulation, timestamp, publisher };
         self.collected.push(Collected { sequence: header.sequence, by_reference, sample });
     }
 
@@ -94,6 +95,11 @@ impl FormerSamples {
     /// Whether all that can be collected is.
     pub fn is_complete(&self, now: MonotonicNs) -> bool {
         self.is_complete || now >= self.give_up_at
+    }
+
+    /// Whether the last sample that the former process has written is among those that are collected.
+    pub fn has_last(&self) -> bool {
+        self.collected.last().map_or(0, |collected| collected.sequence) == self.last_sequence()
     }
 
     /// Leaves those that can't be offered: with a hole before them, readers would take the samples in it for
@@ -113,7 +119,7 @@ impl FormerSamples {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::{Encapsulation, SourceTimestamp};
+    use crate::model::{Encapsulation, Guid, SourceTimestamp};
 
     fn collected(number: i64, sequence: u64) -> Collected {
         let sample = FormerSample {
@@ -121,6 +127,7 @@ mod tests {
             payload: Bytes::new(),
             encapsulation: Encapsulation::CDR_LE,
             timestamp: SourceTimestamp::NONE,
+            publisher: Guid::default(),
         };
         Collected { sequence, by_reference: false, sample }
     }
@@ -156,5 +163,16 @@ mod tests {
         assert_eq!(numbers(&[(7, 25), (9, 26)]), [7, 9]);
         assert_eq!(numbers(&[(6, 22), (9, 26)]), [9]);
         assert!(numbers(&[(6, 22), (7, 25)]).is_empty() && numbers(&[]).is_empty());
+    }
+
+    #[test]
+    fn a_history_is_whole_if_it_has_the_last_sample() {
+        let mut former = former();
+        assert!(!former.has_last());
+        former.collected = vec![collected(7, 25)];
+        assert!(!former.has_last());
+        former.collected.push(collected(9, 26));
+        assert!(former.has_last());
+        assert!(FormerSamples::new(Vec::new(), 3, 0, MonotonicNs(0)).has_last(), "none was written");
     }
 }

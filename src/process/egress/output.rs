@@ -9,7 +9,7 @@ mod missing;
 use std::collections::VecDeque;
 
 use bytes::Bytes;
-use tracing::{error, warn};
+use tracing::error;
 
 use super::super::count_log::DropLog;
 use super::super::error::RoleError;
@@ -24,7 +24,7 @@ use super::history::{History, present_publishers};
 use super::offer::{Offer, RouteDurability};
 use super::overrun::Overrun;
 use super::unsent::{Forwarded, UnsentSamples, count_forwarded, record_sequence};
-use super::writer_record::WriterRecord;
+use super::writer_record::{WriterRecord, latched};
 use crate::clock;
 use crate::config::{self, Forwarding, Settings};
 use crate::dds::{Participant, RawWriter};
@@ -98,6 +98,8 @@ pub(super) struct Output {
     started_at: MonotonicNs,
     /// Whether a sample published since `started_at` has been taken.
     caught_up: bool,
+    /// Whether the writer has the history of the former process.
+    has_former_history: bool,
     /// Starts of ingress at the last housekeeping.
     ingress_starts: u64,
     /// When ingress was started again, until a sample of the new process is taken.
@@ -148,7 +150,9 @@ impl Output {
         // Fewer than the writer retains: to look at all 256 took 4 ms of the pause when a standby takes over.
         let lacking = readers.get().lacking(counters.get());
         let lacking = lacking.map_or(usize::MAX, |forwarded| forwarded as usize + unsent);
-        let most = offer.window_samples.min(lacking.max(1));
+        // Late joiners may need all.
+        let is_latched = latched(output, &info).is_some();
+        let most = if is_latched { usize::MAX } else { offer.window_samples.min(lacking.max(1)) };
         let former_samples = FormerSamples::new(logged, most, unconfirmed, started_at);
         let latched_offer = output.latched_qos.map(|qos| Offer::of(lane, qos));
         let catch_up = match lane.class() {
@@ -196,6 +200,7 @@ impl Output {
             unmatched: Vec::new(),
             started_at,
             caught_up: false,
+            has_former_history: false,
             ingress_starts: boards.health(ProcessRole::Ingress).map_or(0, |health| health.starts),
             ingress_restarted_at: None,
             shm: boards.histogram_writer(Stage::Shm(lane_index), output.route),
@@ -262,7 +267,8 @@ impl Output {
                 SequenceOutcome::InOrder => {}
                 SequenceOutcome::AfterGap(missing) => self.count_missing(missing, sample.header()),
                 SequenceOutcome::Duplicate => {
-                    if self.offer.qos.durability == Durability::TransientLocal && !self.caught_up {
+                    let is_latched = self.offer.qos.durability == Durability::TransientLocal;
+                    if is_latched && !self.caught_up && !self.has_former_history {
                         self.restore(&sample);
                     }
                     continue;
@@ -565,27 +571,6 @@ impl Output {
         if let Some(info) = self.boards.route_info(self.route) {
             self.durability.set(info.durability());
         }
-    }
-
-    /// Writes a sample that was forwarded before a restart again, for late joiners.
-    fn restore(&mut self, sample: &ShmSample) {
-        if self.topic.is_former(sample.header().sequence) || sample.header().key.is_keyed() != self.has_keys {
-            return;
-        }
-        let Some(history) = &mut self.history else { return };
-        let (header, publisher) = (sample.header(), sample.header().writer_guid);
-        let payload = Bytes::copy_from_slice(sample.payload());
-        let kept = history.kept(&payload, header);
-        if kept.is_none()
-            && let Some(writer) = &self.writer
-        {
-            let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
-            let written = writer.write_from(Some(publisher), payload, encapsulation, timestamp, header.key);
-            if let Err(failure) = written {
-                warn!(route = self.id, lane = self.lane, %failure, "cannot restore the history after a restart");
-            }
-        }
-        history.add(publisher, kept, self.writer.as_ref(), || present_publishers(&self.boards, self.route));
     }
 }
 

@@ -7,15 +7,22 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use super::super::role::Role;
 use crate::config::Output;
 use crate::dds::{Participant, WriterContinuation};
-use crate::model::{DdsType, Durability, EndpointIdentity, Guid, QosProfile};
+use crate::model::{DdsType, Durability, EndpointIdentity, Guid, QosProfile, Reliability, RouteInfo};
 use crate::shm::{BoardWriter, ProcessRole, SendLog};
 
+/// What the output offers if it is TRANSIENT_LOCAL.
+pub(super) fn latched(output: &Output, info: &RouteInfo) -> Option<QosProfile> {
+    let followed = output.latched_qos.filter(|_| info.durability() == Durability::TransientLocal);
+    followed.or(Some(output.qos)).filter(|qos| qos.durability == Durability::TransientLocal)
+}
+
 /// Whether the output is such that readers of the former process can be served as if nothing had happened:
-/// without a history and without keys.
+/// without keys, and without a history that is sent to late joiners as new samples.
 fn may_be_continued(role: &Role, output: &Output) -> bool {
     let info = role.boards.route_info(output.route).unwrap_or_default();
-    let is_latched = output.latched_qos.is_some() && info.durability() == Durability::TransientLocal;
-    output.qos.durability == Durability::Volatile && !is_latched && info.has_keys == 0
+    let has_history_of_reliable =
+        latched(output, &info).is_none_or(|qos| qos.reliability == Reliability::Reliable);
+    has_history_of_reliable && info.has_keys == 0
 }
 
 /// The next writer of an output.
@@ -60,6 +67,11 @@ impl WriterRecord {
     /// sequence number in the route. [`next`](Self::next) may find that its writer can't be continued.
     pub fn logged(&self) -> Vec<(i64, u64)> {
         if self.is_continuable() { self.log.samples() } else { Vec::new() }
+    }
+
+    /// The next writer is not that of the former process.
+    pub const fn give_up(&mut self) {
+        self.may_continue = false;
     }
 
     /// To be called before the sample with this sequence number in the route is written.

@@ -34,7 +34,6 @@ const NOT_PASSED: &[(&str, &str, &str)] = &[
     ("src/dds/writer.rs", "to_bytes", "the library reads the payload that it was handed"),
     ("src/dds/writer.rs", "output_encapsulation", "the library reads the payload that it was handed"),
     ("src/process/egress/output.rs", "drop_sample", "counts a sample that is not sent"),
-    ("src/process/egress/output.rs", "restore", "samples from before a restart only"),
     ("src/process/ingress/pool.rs", "lock", "large samples only"),
     ("src/shm/publisher.rs", "into_slot", "large samples only"),
 ];

@@ -4,6 +4,7 @@ use tracing::{error, info};
 
 use super::super::super::error::RoleError;
 use super::super::former_readers::FormerReaders;
+use super::super::history::present_publishers;
 use super::super::offer::Offer;
 use super::super::overrun::Overrun;
 use super::super::unsent::UnsentSamples;
@@ -139,6 +140,13 @@ impl Output {
             return Ok(());
         }
         let Offer { qos, window_samples, supersedes } = self.offer;
+        // What late joiners need may still come, and is then written again.
+        let lacks_history =
+            self.history.is_some() && self.former.as_ref().is_some_and(|former| !former.has_last());
+        if let Some(record) = self.record.as_mut().filter(|_| lacks_history) {
+            record.give_up();
+        }
+        let mut publishers = Vec::new();
         let continuation = self
             .record
             .as_mut()
@@ -158,6 +166,8 @@ impl Output {
                     self.counters.update(|counters| counters.accounted_number = 0);
                 }
                 continuation.samples = self.close_former_account(is_continued, now);
+                self.has_former_history = is_continued && self.history.is_some();
+                publishers = continuation.samples.iter().map(|sample| sample.publisher).collect();
                 continuation.sent_through = self.counters.get().accounted_number;
                 continuation.readers = self.former_readers.missing().to_vec();
                 let topic = &self.topic.dds_topic;
@@ -181,6 +191,11 @@ impl Output {
         );
         if supersedes {
             writer.skip_evicted();
+        }
+        if let Some(history) = &mut self.history {
+            for publisher in publishers {
+                history.add(publisher, None, Some(&writer), || present_publishers(&self.boards, self.route));
+            }
         }
         self.writer = Some(writer);
         self.type_hash = dds_type.hash;

@@ -7,6 +7,7 @@ use bytes::Bytes;
 use tracing::warn;
 
 use super::super::arena::CopyArena;
+use super::super::history::present_publishers;
 use super::super::unsent::{Forwarded, record_sequence};
 use super::Output;
 use crate::clock;
@@ -64,8 +65,15 @@ impl Output {
                 continue;
             }
             let by_reference = self.may_pass_by_reference(sample.payload().len());
+            let is_latched = self.history.is_some();
             former.collect(sample, by_reference, |sample| {
-                if by_reference { Bytes::from_owner(sample) } else { arena.copy(sample.payload()) }
+                if by_reference {
+                    Bytes::from_owner(sample)
+                } else if is_latched {
+                    Bytes::copy_from_slice(sample.payload())
+                } else {
+                    arena.copy(sample.payload())
+                }
             });
         }
         let is_complete = former.is_complete(now);
@@ -138,5 +146,32 @@ impl Output {
         self.readers.set(self.former_readers.on_board(self.counters.get().forwarded));
         self.next.extend(former.next);
         former.collected.into_iter().map(|collected| collected.sample).collect()
+    }
+
+    /// Writes a sample that was forwarded before a restart again, for late joiners.
+    pub(super) fn restore(&mut self, sample: &ShmSample) {
+        if self.topic.is_former(sample.header().sequence) || sample.header().key.is_keyed() != self.has_keys {
+            return;
+        }
+        let Some(history) = &mut self.history else { return };
+        let (header, publisher) = (sample.header(), sample.header().writer_guid);
+        let payload = Bytes::copy_from_slice(sample.payload());
+        let kept = history.kept(&payload, header);
+        if kept.is_none()
+            && let Some(writer) = &self.writer
+        {
+            if let Some(record) = &self.record {
+                record.writing(header.sequence);
+            }
+            let (encapsulation, timestamp) = (header.encapsulation, header.source_timestamp);
+            match writer.write_from(Some(publisher), payload, encapsulation, timestamp, header.key) {
+                // The former process has accounted for the sample.
+                Ok(written) => self.counters.update(|it| it.accounted_number = written.sequence),
+                Err(failure) => {
+                    warn!(route = self.id, lane = self.lane, %failure, "cannot restore the history after a restart");
+                }
+            }
+        }
+        history.add(publisher, kept, self.writer.as_ref(), || present_publishers(&self.boards, self.route));
     }
 }

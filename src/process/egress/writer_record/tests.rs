@@ -94,7 +94,13 @@ fn readers_are_told_of_a_writer_that_is_not_continued() {
     let output = &settings.lanes[LANE].outputs[0];
     assert!(may_be_continued(&role, output));
     let latched = QosProfile { durability: Durability::TransientLocal, ..output.qos };
-    assert!(!may_be_continued(&role, &Output { qos: latched, ..output.clone() }));
+    assert!(may_be_continued(&role, &Output { qos: latched, ..output.clone() }));
+    let best_effort = QosProfile { reliability: Reliability::BestEffort, ..latched };
+    assert!(!may_be_continued(&role, &Output { qos: best_effort, ..output.clone() }));
+    role.boards.route_info_writer(0).update(|info| info.transient_local = 1);
+    assert!(!may_be_continued(&role, &Output { latched_qos: Some(best_effort), ..output.clone() }));
+    role.boards.route_info_writer(0).update(|info| info.transient_local = 0);
+    assert!(may_be_continued(&role, &Output { latched_qos: Some(best_effort), ..output.clone() }));
     role.boards.route_info_writer(0).update(|info| info.has_keys = 1);
     assert!(!may_be_continued(&role, output));
 }

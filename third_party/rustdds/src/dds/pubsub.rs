@@ -615,10 +615,6 @@ impl InnerPublisher {
       max_retain,
     )
     .numbered_with(dp.numbers());
-    let send_buffer = match continued {
-      Some(continued) => send_buffer.continue_former(continued),
-      None => send_buffer,
-    };
     // A KEEP_LAST writer never waits for a reader: what DDS calls KEEP_LAST is that
     // the oldest sample gives way (DDS v1.4 Section 2.2.3.18). The resource limit
     // bounds what is retained for repairs.
@@ -627,6 +623,10 @@ impl InnerPublisher {
         send_buffer.keep_last(depth.max(1) as usize)
       }
       _ => send_buffer,
+    };
+    let send_buffer = match continued {
+      Some(continued) => send_buffer.continue_former(continued),
+      None => send_buffer,
     };
     // Doorbell: enqueue this writer's entity id and wake the participant poll.
     let doorbell = Doorbell::new(guid.entity_id, self.writer_ready.clone());

@@ -80,6 +80,9 @@ pub struct ContinuedSample {
   pub encoding_options: [u8; 2],
   /// The source timestamp, if it has one.
   pub source_timestamp: Option<Timestamp>,
+  /// Of a writer that is not VOLATILE: whose history it is in, see
+  /// `WriteOptionsBuilder::history_source`.
+  pub history_source: Option<GUID>,
 }
 
 impl ContinuedSample {
@@ -89,6 +92,10 @@ impl ContinuedSample {
     let options = WriteOptionsBuilder::new();
     let options = match self.source_timestamp {
       Some(timestamp) => options.source_timestamp(timestamp),
+      None => options,
+    };
+    let options = match self.history_source {
+      Some(source) => options.history_source(source),
       None => options,
     };
     (options.build(), DDSData::new(payload))

@@ -337,7 +337,7 @@ impl WriterSendBuffer {
   }
 
   /// Continues the writer of a former process, with its last samples. To be called before
-  /// the buffer is shared.
+  /// the buffer is shared, and after `keep_last`.
   #[must_use]
   pub fn continue_former(mut self, continued: ContinuedWriter) -> Self {
     let Some(shared) = Arc::get_mut(&mut self.shared) else {
@@ -355,6 +355,9 @@ impl WriterSendBuffer {
       for sample in continued.samples {
         let number = SequenceNumber::new(sample.number);
         let (options, data) = sample.into_data();
+        if let (false, Some(depth)) = (shared.volatile, shared.keep_last) {
+          inner.history.record(&options, number, depth);
+        }
         let change = CacheChange::new(shared.writer_guid, number, options, data);
         inner.retained_bytes += change.data_value.payload_size();
         inner.changes.insert(number, change);
@@ -839,9 +842,8 @@ impl WriterSendBuffer {
     let next = inner.last_seq.plus_1();
     let first_unsent = self.shared.direct_send.last_sent().plus_1().min(next);
     let mut history = None;
-    let is_former = inner.former_readers.remove(&reader);
-    let first_offered = if !wants_history {
-      if is_former { inner.first_seq.min(first_unsent) } else { first_unsent }
+    let first_of_new = if !wants_history {
+      first_unsent
     } else if let Some(mut listed) = inner.history.numbers() {
       listed.split_off(&first_unsent);
       let first = listed.first().copied().unwrap_or(first_unsent);
@@ -853,10 +855,17 @@ impl WriterSendBuffer {
     } else {
       Self::history_first_locked(&self.shared, &inner)
     };
+    let first_offered = if inner.former_readers.remove(&reader) {
+      // It got the history from the former writer, and may lack any sample since.
+      history = None;
+      inner.first_seq.min(first_unsent)
+    } else {
+      first_of_new
+    };
     let withdrawn = inner.withdrawn.range(first_offered..).count() as u64;
     let progress = ReaderProgress::new(reader, reliable, first_offered)
       .with_history(history)
-      .or_if_reset(if wants_history { first_offered } else { first_unsent })
+      .or_if_reset(first_of_new)
       .without_withdrawn(inner.withdrawn_total - withdrawn);
     let progress = Arc::new(progress);
     inner.readers.insert(reader, progress.clone());
@@ -1225,6 +1234,7 @@ mod tests {
       encoding: RepresentationIdentifier::CDR_LE,
       encoding_options: [0, 0],
       source_timestamp: None,
+      history_source: None,
     };
     let buf = small_buffer(EntityKind::WRITER_NO_KEY_USER_DEFINED).continue_former(ContinuedWriter {
       samples: [37, 38, 40, 41].map(sample).into(),
@@ -1250,6 +1260,50 @@ mod tests {
     assert_eq!(buf.retained_len(), 1);
   }
 
+  // A former reader may lack any of its samples. A late joiner gets the last ones of each source.
+  #[test]
+  fn a_continued_writer_has_the_history_of_the_former_one() {
+    let number = SequenceNumber::new;
+    let reader = |id: u8| GUID::new(GuidPrefix::new(&[id; 12]), EntityId::PARTICIPANT);
+    let source = |id: u8| GUID::new(GuidPrefix::new(&[100 + id; 12]), EntityId::PARTICIPANT);
+    let sample = |(number, of): (i64, u8)| crate::ContinuedSample {
+      number,
+      payload: Bytes::from(vec![number as u8; 8]),
+      encoding: RepresentationIdentifier::CDR_LE,
+      encoding_options: [0, 0],
+      source_timestamp: None,
+      history_source: Some(source(of)),
+    };
+    let continuing = |samples: &[(i64, u8)]| {
+      let guid = EntityId::new([0, 0, 1], EntityKind::WRITER_NO_KEY_USER_DEFINED);
+      let guid = GUID::new(GuidPrefix::new(&[1; 12]), guid);
+      WriterSendBuffer::new(guid, "latched".to_string(), true, false, false, 256, 256, 2)
+        .keep_last(2)
+        .continue_former(ContinuedWriter {
+          samples: samples.iter().copied().map(sample).collect(),
+          sent_through: 41,
+          readers: vec![reader(1)],
+          ..ContinuedWriter::after(41)
+        })
+    };
+    let one_source = continuing(&[(38, 1), (39, 1), (40, 1), (41, 1)]);
+    let several = continuing(&[(37, 2), (38, 1), (39, 1), (40, 1), (41, 1)]);
+    for (buf, first, of_late_joiner) in
+      [(one_source, 38, vec![40, 41]), (several, 37, vec![37, 40, 41])]
+    {
+      let offered = |id: u8| buf.reader_matched(reader(id), true, true);
+      assert_eq!(offered(1).first_offered(), number(first), "a former reader");
+      assert_eq!(offered(2).first_offered(), number(of_late_joiner[0]), "a late joiner");
+      // Both have acknowledged everything.
+      buf.set_acked_frontier(Some(number(42)));
+      buf.release_acknowledged(number(42));
+      let kept: Vec<i64> = buf.history_before(number(42)).into_iter().map(i64::from).collect();
+      assert_eq!(kept, of_late_joiner);
+      assert!(kept.iter().all(|kept| buf.get_by_sn(number(*kept)).is_some()));
+      assert!(buf.get_by_sn(number(39)).is_none());
+    }
+  }
+
   #[test]
   fn the_numbers_of_a_former_writer_are_checked() {
     let with = |numbers: &[i64], highest: i64| {
@@ -1259,6 +1313,7 @@ mod tests {
         encoding: RepresentationIdentifier::CDR_LE,
         encoding_options: [0, 0],
         source_timestamp: None,
+        history_source: None,
       };
       let samples = numbers.iter().map(sample).collect();
       ContinuedWriter { samples, ..ContinuedWriter::after(highest) }.is_valid()

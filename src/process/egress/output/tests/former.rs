@@ -1,6 +1,7 @@
 //! What a killed process of a lane that keeps its identity leaves to the next one.
 
 use super::*;
+use crate::dds::Take;
 use crate::model::ProcessIdentity;
 
 /// The next process of the lane continues the participant of this one.
@@ -160,4 +161,45 @@ fn the_writer_of_a_place_is_continued_if_the_place_has_the_same_topic() {
     assert_ne!(writer(&third), first_writer);
     assert!(third.former_readers.is_empty());
     assert!(third.counters.get().is_accounted_for(), "{:?}", third.counters.get());
+}
+
+/// The history of a latched output: the last sample of each publisher.
+#[test]
+fn a_latched_output_is_continued_with_its_history() {
+    let yaml = "topics: [{id: scan, input_topic: /scan, retained_samples: 8, \
+                qos_overrides: {critical: {durability: TRANSIENT_LOCAL, depth: 1}}}]";
+    let mut host = Host::start(175, CRITICAL, yaml);
+    host.announce_type();
+    keep_identity(&mut host);
+    let mut first = host.open();
+    let writer = |output: &Output| output.writer.as_ref().unwrap().guid();
+    let first_writer = writer(&first);
+    for (sequence, publisher) in [(11, 1), (12, 2), (13, 2)] {
+        host.publish(SampleHeader { writer_guid: Guid([publisher; 16]), ..header(sequence) }, 8);
+        host.send(&mut first);
+    }
+    drop(first);
+
+    let mut second = open_next(&mut host);
+    assert_eq!(writer(&second), first_writer);
+    // Ingress may deliver what was read from its backlog.
+    host.publish(SampleHeader { published_at: MonotonicNs(second.started_at.0 - 1), ..header(13) }, 8);
+    assert!(second.take().is_none());
+    let log = host.role.boards.send_log(CRITICAL, 0);
+    assert_eq!(log.samples(), [(1, 11), (2, 12), (3, 13)], "none is written again");
+    assert!(second.counters.get().is_accounted_for(), "{:?}", second.counters.get());
+    let late = host.subscribe(Durability::TransientLocal);
+    let mut numbers = Vec::new();
+    wait_until("the history", || {
+        while let Take::Sample(sample) = late.reader.take(&mut |_, _| {}) {
+            numbers.push(sample.sequence);
+        }
+        numbers == [1, 3]
+    });
+    drop(second);
+
+    // The last sample is not there when the wait ends, and may come later: it would be written again.
+    log.record(4, 14);
+    let third = open_next(&mut host);
+    assert_ne!(writer(&third), first_writer);
 }
