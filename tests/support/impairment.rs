@@ -73,6 +73,12 @@ impl Impairment {
         self.wait_for("ended")
     }
 
+    /// Ends it. It must have lost no packet beyond those that it was to lose.
+    pub fn end_without_overflow(self) {
+        let counters = self.end();
+        assert_eq!([&counters["overflowed"], &counters["kernel_dropped"]], [0, 0], "{counters}");
+    }
+
     /// Sends it a signal, such as SIGSTOP or SIGCONT.
     pub fn signal(&self, signal: Signal) {
         self.process.signal(signal);
