@@ -158,11 +158,12 @@ pub const DEFAULT_WRITER_MAX_SAMPLES: usize = 8192;
 // are retained whatever their size.
 pub const KEEP_LAST_MAX_RETAINED_BYTES: usize = 32 << 20;
 
-// Payload bytes that a Writer sends to all its readers in one turn of the event loop;
-// one sample at least. A Writer that is given more than the sockets or the CPU take
-// would else keep the loop from ACKNACKs, repairs and discovery for as long as that
-// lasts: 1 MiB at 30 Hz to eleven readers went out for 25 s, and no reader received a
-// whole sample.
+// Payload bytes that a Writer sends in one turn of the event loop, counted once for each
+// of its readers; one sample at least. A Writer that is given more than the sockets or the
+// CPU take would else keep the loop from ACKNACKs, repairs and discovery for as long as
+// that lasts: 1 MiB at 30 Hz to eleven readers went out for 25 s, and no reader received a
+// whole sample. Counted once for all of 14 readers, 89 samples of 3 KB took 80 ms, after
+// which the loop received 64 datagrams: ACKNACKs waited for 4 s.
 pub const PENDING_TURN_MAX_BYTES: usize = 256 << 10;
 
 // How many evicted samples a HEARTBEAT still offers, so that a reader which lacks

@@ -902,6 +902,7 @@ impl Writer {
     if send_buffer.holds_unsent() {
       return false;
     }
+    let receivers = self.readers.len().max(1);
     let mut turn_bytes = 0;
     while turn_bytes < PENDING_TURN_MAX_BYTES {
       let last_available = self.send_buffer.last_change_sequence_number();
@@ -931,6 +932,8 @@ impl Writer {
             self.sample_cursor = SampleCursor::Fresh;
             self.send_buffer.set_sent_frontier(last_seq);
             self.offer_to_joining_readers();
+            // About a datagram.
+            turn_bytes += FRAGMENT_SIZE * receivers;
             continue;
           }
           Some(BatchOutcome::Blocked { blocked }) => {
@@ -966,7 +969,7 @@ impl Writer {
         continue;
       };
       let write_options = cc.write_options.clone();
-      turn_bytes += cc.data_value.payload_size();
+      turn_bytes += cc.data_value.payload_size() * receivers;
 
       // Notify reader proxies once per sample (only when starting it fresh).
       if self.sample_cursor == SampleCursor::Fresh && !self.like_stateless {
@@ -5010,6 +5013,29 @@ mod tests {
       assert_eq!(send(20, 8), [vec![], vec![]], "samples of one datagram");
       assert_eq!(send(1, 200_000), [vec![(1, 13)], vec![]]);
       assert_eq!(send(1, 200_000), [vec![(1, 14)], vec![]]);
+    }
+
+    // The event loop has ACKNACKs to receive before the next turn.
+    #[test]
+    fn a_turn_sends_fewer_samples_to_more_readers() {
+      let sent_in_a_turn = |readers: u8, payload_len| {
+        let mut f = keep_last();
+        let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+        let qos = QosPolicyBuilder::new().reliability(Reliability::BestEffort).build();
+        for id in 1..readers {
+          let guid = GUID::new(GuidPrefix::new(&[id; 12]), EntityId::UNKNOWN);
+          let mut proxy = RtpsReaderProxy::new(guid, qos.clone(), false);
+          proxy.unicast_locator_list = vec![Locator::from(socket.local_addr().unwrap())];
+          f.writer.update_reader_proxy(&proxy, &qos);
+        }
+        assert_eq!(f.writer.readers.len(), readers.into());
+        let last_sent = f.writer.last_sent();
+        write(&f, 200, payload_len);
+        f.writer.set_last_sent(last_sent);
+        assert!(f.writer.process_pending(), "some are left");
+        i64::from(f.writer.last_sent()) - i64::from(last_sent)
+      };
+      assert_eq!([1, 16].map(|readers| sent_in_a_turn(readers, 4_092)), [64, 4]);
     }
 
     // What a reader at `socket` has got, by now: the fragments of each number, and the last
