@@ -853,7 +853,9 @@ impl WriterSendBuffer {
       });
       first
     } else {
-      Self::history_first_locked(&self.shared, &inner)
+      // What is not sent yet goes to the reader when it is sent, also what is not among the
+      // last samples of the history any more.
+      Self::history_first_locked(&self.shared, &inner).min(first_unsent)
     };
     let first_offered = if inner.former_readers.remove(&reader) {
       // It got the history from the former writer, and may lack any sample since.
@@ -1258,6 +1260,26 @@ mod tests {
     assert!(buf.has_unsent() && !buf.holds_unsent(), "all former readers have matched");
     buf.release_acknowledged(number(41));
     assert_eq!(buf.retained_len(), 1);
+  }
+
+  // Their GAP would withdraw some of the samples that are sent to it next.
+  #[test]
+  fn a_late_joiner_is_offered_all_that_is_not_sent_yet() {
+    let guid = EntityId::new([0, 0, 1], EntityKind::WRITER_NO_KEY_USER_DEFINED);
+    let guid = GUID::new(GuidPrefix::new(&[1; 12]), guid);
+    let buf = WriterSendBuffer::new(guid, "latched".to_string(), true, false, false, 256, 256, 2)
+      .keep_last(2);
+    for _ in 0..10 {
+      assert!(admit_now(&buf, WriteOptions::default()));
+    }
+    let mut offered = (1..).map(|id| {
+      let reader = GUID::new(GuidPrefix::new(&[id; 12]), EntityId::PARTICIPANT);
+      buf.reader_matched(reader, true, true).first_offered()
+    });
+    for (last_sent, expected) in [(4, 5), (8, 9), (10, 9)] {
+      buf.direct_send().set_last_sent(SequenceNumber::new(last_sent));
+      assert_eq!(offered.next(), Some(SequenceNumber::new(expected)), "{last_sent} were sent");
+    }
   }
 
   // A former reader may lack any of its samples. A late joiner gets the last ones of each source.
